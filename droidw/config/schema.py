@@ -1,0 +1,209 @@
+"""The configuration as dataclasses: every key, its default, its range and what it means.
+
+Defaults here are those of preset `cpu`. `metadata["help"]` feeds `--help`, `docs/` and error
+messages; `metadata["ge"]`, `["gt"]`, `["le"]`, `["lt"]` are checked when a config is resolved.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+__all__ = [
+    "BackendConfig",
+    "CameraConfig",
+    "CloudConfig",
+    "DroidwConfig",
+    "FillerConfig",
+    "FrontendConfig",
+    "InputConfig",
+    "MotionFilterConfig",
+    "PhaseConfig",
+    "SlotConfig",
+    "SolverConfig",
+    "WeightingConfig",
+    "opt",
+]
+
+
+def opt(default: Any, help: str, **limits: Any) -> Any:  # noqa: A002 - the key's public name
+    """A dataclass field with help text and limits (`ge`, `gt`, `le`, `lt`)."""
+    metadata = {"help": help, **limits}
+    if isinstance(default, (list, dict)):
+        value = default
+        return field(default_factory=lambda: type(value)(value), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+@dataclass
+class SlotConfig:
+    """A plugin by name and its options; a bare name is shorthand for `{name: ...}`."""
+
+    name: str = opt("???", "name of the plugin (droidw list-plugins)")
+    options: dict[str, Any] = opt({}, "options of that plugin (droidw list-plugins --options NAME)")
+
+
+@dataclass
+class InputConfig:
+    """What is read."""
+
+    source: str = opt("", "folder, video file, or reader:sequence")
+    stride: int = opt(1, "keep every n-th picture", ge=1)
+    skip: int = opt(0, "leave out the first n pictures", ge=0)
+    max_frames: int = opt(0, "stop after n pictures (0: all)", ge=0)
+
+
+@dataclass
+class CameraConfig:
+    """The camera and the working size."""
+
+    calib: str | None = opt(None, "calibration file; overrides what the source says")
+    focal: float | None = opt(None, "focal length in pixels of the raw picture", gt=0)
+    fov: float | None = opt(None, "horizontal field of view in degrees", gt=1, lt=179)
+    long_side: int = opt(320, "working size: the longer side is reduced to this, in pixels", ge=64)
+    size: list[int] = opt([], "working size [width, height] instead of `long_side`")
+    edge: int = opt(0, "pixels cropped off each side after resizing", ge=0)
+
+
+@dataclass
+class MotionFilterConfig:
+    """Which frames become candidates for keyframes."""
+
+    threshold: float = opt(0.9, "mean flow from the last keyframe, in grid cells", gt=0)
+    force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
+    min_matched: float = opt(
+        0.5, "a frame in which less than this share of the cells is matched is taken at once",
+        ge=0, le=1,
+    )
+
+
+@dataclass
+class SolverConfig:
+    """Damping and robustness of bundle adjustment in one phase."""
+
+    lm: float = opt(1e-4, "relative damping of the reduced system", ge=0)
+    ep: float = opt(0.1, "absolute damping of the reduced system", ge=0)
+    huber: float = opt(0.0, "Huber threshold in grid cells (0: quadratic)", ge=0)
+    guard: bool = opt(False, "shorten or reject a step that raises the energy")
+
+
+@dataclass
+class PhaseConfig:
+    """One row of the schedule (REFERENCE 4.4): how one phase alternates its parts."""
+
+    updates: int = opt(4, "update steps (correspondence, then bundle adjustment)", ge=0)
+    iterations: int = opt(2, "Gauss-Newton iterations per update step", ge=1)
+    learn: bool = opt(True, "uncertainty is updated after each Gauss-Newton iteration")
+    weigh: bool = opt(True, "uncertainty weighs the residuals")
+    depth_prior: bool = opt(True, "the depth prior takes part")
+
+
+@dataclass
+class FrontendConfig:
+    """Initialisation and the sliding window."""
+
+    warmup: int = opt(8, "keyframes before initialisation", ge=2)
+    beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
+    init_beta: float = opt(0.25, "the same during initialisation", ge=0, le=1)
+    keyframe_threshold: float = opt(0.5, "distance below which the newest keyframe is dropped",
+                                    ge=0)
+    threshold: float = opt(16.0, "largest frame distance of a proximity edge, in cells", gt=0)
+    window: int = opt(25, "keyframes searched for proximity edges", ge=2)
+    radius: int = opt(2, "neighbours always linked", ge=1)
+    nms: int = opt(1, "suppression radius around existing edges", ge=0)
+    max_factors: int = opt(75, "active edges at most", ge=4)
+    max_age: int = opt(50, "updates after which an edge is retired", ge=1)
+
+
+@dataclass
+class BackendConfig:
+    """Global bundle adjustment after tracking."""
+
+    passes: list[int] = opt([7, 12], "update steps of each global pass")
+    beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
+    threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
+    radius: int = opt(1, "neighbours always linked", ge=1)
+    nms: int = opt(5, "suppression radius around chosen edges", ge=0)
+    factors_per_keyframe: int = opt(6, "directed edges per keyframe at most", ge=2)
+
+
+@dataclass
+class FillerConfig:
+    """Poses of the frames that are not keyframes."""
+
+    updates: int = opt(3, "motion-only update steps per batch", ge=0)
+    batch: int = opt(16, "frames per batch", ge=1)
+
+
+@dataclass
+class WeightingConfig:
+    """How uncertainty u becomes a weight in [0,1] (REFERENCE 3.1)."""
+
+    gate: Literal["rational", "inverse", "none"] = opt(
+        "rational", "rational: 1/max(slope*u - shift, floor); inverse: 1/u; both clamped to [0,1]"
+    )
+    slope: float = opt(45.0, "slope of the rational gate", gt=0)
+    shift: float = opt(35.0, "shift of the rational gate", ge=0)
+    floor: float = opt(0.1, "smallest denominator of the rational gate", gt=0)
+    bidirectional: bool = opt(False, "also weigh by the gate sampled in the target frame")
+    confidence_scale: float = opt(1.0, "factor on the confidence of correspondence", gt=0)
+    damping_scale: float = opt(0.2, "factor on the learned depth damping", ge=0)
+    damping_floor: float = opt(1e-7, "added to the depth damping", ge=0)
+    prior_weight: float = opt(0.001, "gamma_d, weight of the depth prior", ge=0)
+
+
+@dataclass
+class CloudConfig:
+    """Which depths count as seen consistently, and go into the static cloud."""
+
+    relative_threshold: float = opt(0.02, "largest relative depth disagreement with a neighbour",
+                                    gt=0)
+    min_views: int = opt(2, "neighbouring keyframes that must agree", ge=0)
+    min_weight: float = opt(0.5, "smallest uncertainty weight of a static point", ge=0, le=1)
+    far: float = opt(4.0, "depths beyond this many times the median are left out (0: keep)", ge=0)
+    max_points: int = opt(2_000_000, "points at most; evenly thinned beyond", ge=1)
+
+
+@dataclass
+class DroidwConfig:
+    """A whole run."""
+
+    input: InputConfig = field(default_factory=InputConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+
+    reader: SlotConfig = field(default_factory=lambda: SlotConfig("auto"))
+    features: SlotConfig = field(default_factory=lambda: SlotConfig("cnn"))
+    depth: SlotConfig = field(default_factory=lambda: SlotConfig("none"))
+    uncertainty: SlotConfig = field(default_factory=lambda: SlotConfig("affine-softplus"))
+    ba: SlotConfig = field(default_factory=lambda: SlotConfig("torch"))
+    correspondence: SlotConfig = field(default_factory=lambda: SlotConfig("flow"))
+    exporters: dict[str, Any] = opt(
+        {"trajectory": {}, "ply": {}}, "exporter name -> its options; null switches one off"
+    )
+    observers: dict[str, Any] = opt(
+        {"progress": {}, "report": {}}, "observer name -> its options; null switches one off"
+    )
+
+    motion_filter: MotionFilterConfig = field(default_factory=MotionFilterConfig)
+    frontend: FrontendConfig = field(default_factory=FrontendConfig)
+    backend: BackendConfig = field(default_factory=BackendConfig)
+    filler: FillerConfig = field(default_factory=FillerConfig)
+    weighting: WeightingConfig = field(default_factory=WeightingConfig)
+    cloud: CloudConfig = field(default_factory=CloudConfig)
+    schedule: dict[str, PhaseConfig] = field(
+        default_factory=lambda: {
+            "init_blind": PhaseConfig(updates=8, weigh=False),
+            "init": PhaseConfig(updates=8),
+            "window": PhaseConfig(updates=2),
+            "window_kept": PhaseConfig(updates=2),
+            "global": PhaseConfig(updates=0, learn=False, depth_prior=False),
+        },
+        metadata={"help": "phases: init_blind, init, window, window_kept, global"},
+    )
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    global_solver: SolverConfig = field(default_factory=lambda: SolverConfig(lm=1e-5, ep=1e-2))
+
+    device: str = opt("auto", "auto, cpu, cuda, cuda:N")
+    seed: int = opt(0, "seed of everything that draws numbers", ge=0)
+    threads: int = opt(0, "worker threads for decoding and flow (0: as many as cores)", ge=0)
+    compat: list[str] = opt([], "published behaviours to reproduce, e.g. [droid-w]")

@@ -1,0 +1,117 @@
+"""Correspondence: where the cells of one keyframe lie in another, and how surely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from droidw.geometry.camera import Grid
+    from droidw.slam.frame import Frame
+
+__all__ = ["Correspondence", "EdgeRequest", "EdgeSession", "EdgeUpdate", "Motion"]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How far the picture moved between two frames.
+
+    Attributes:
+        flow: mean length of the flow in grid cells, over what could be matched.
+        matched: share of cells in [0,1] that could be matched.
+    """
+
+    flow: float
+    matched: float
+
+
+@dataclass(frozen=True)
+class EdgeRequest:
+    """A question for one round of correspondence over E directed edges i -> j.
+
+    Attributes:
+        ids: E numbers that name the edges for as long as a session lives; an id that the
+            session has not seen is a new edge.
+        ii, jj: E node numbers, arguments of `payload`.
+        coords: [E,h,w,2] where the current poses and depths put each cell of i in j, in cells
+            of j's grid, x then y; finite everywhere.
+        valid: [E,h,w] bool, whether `coords` means anything (in front of the camera).
+        payload: node number -> what `encode`/`context` returned for that frame.
+        informed: whether poses and depths are good enough to search around `coords`.
+    """
+
+    ids: list[int]
+    ii: list[int]
+    jj: list[int]
+    coords: Tensor
+    valid: Tensor
+    payload: Callable[[int], Any]
+    informed: bool = True
+
+
+@dataclass(frozen=True)
+class EdgeUpdate:
+    """The answer, in the order of the request.
+
+    Attributes:
+        target: [E,h,w,2] float32, measured position of each cell of i in j, cells, x then y.
+        confidence: [E,h,w,2] float32 >= 0, weight of the x and of the y measurement; the scale
+            belongs to the correspondence and is matched by the preset's damping.
+        damping: [U,h,w] learned depth damping of the source frames, or None.
+        sources: the U node numbers of `damping` and `upmask`, ascending, or None.
+        upmask: [U,576,h,w] convex upsampling mask, or None.
+    """
+
+    target: Tensor
+    confidence: Tensor
+    damping: Tensor | None = None
+    sources: list[int] | None = None
+    upmask: Tensor | None = None
+
+
+@runtime_checkable
+class EdgeSession(Protocol):
+    """The state of the edges of one factor graph."""
+
+    def update(self, request: EdgeRequest) -> EdgeUpdate:
+        """One round: measure new edges, refine or re-use the old ones."""
+        ...
+
+    def forget(self, ids: list[int]) -> None:
+        """Drop the state of these edges; unknown ids are ignored."""
+        ...
+
+
+@runtime_checkable
+class Correspondence(Protocol):
+    """Measures dense correspondence on a regular grid of cells.
+
+    An operator with a recurrent state (`droid`) moves its target at every `update`; one that
+    measures (`flow`) computes an edge once, and again when the prediction has moved away from
+    where it started. Both are the same to the core.
+
+    Attributes:
+        stride, offset: the grid: cell (x, y) lies at pixel `stride * (x, y) + offset`.
+    """
+
+    stride: int
+    offset: float
+
+    def encode(self, frame: Frame, grid: Grid) -> Any:
+        """What is needed of every frame; opaque to the core, cheap to hold."""
+        ...
+
+    def context(self, payload: Any, frame: Frame, grid: Grid) -> Any:
+        """What is needed in addition of a keyframe; may return `payload` itself."""
+        ...
+
+    def motion(self, reference: Any, current: Any) -> Motion:
+        """How far the picture moved from `reference` to `current` (payloads)."""
+        ...
+
+    def session(self, *, low_memory: bool = False) -> EdgeSession:
+        """Fresh edge state; `low_memory` for graphs with very many edges."""
+        ...

@@ -1,0 +1,34 @@
+"""Feature extractors: what the uncertainty model compares between views."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from droidw.geometry.camera import Grid
+
+__all__ = ["FeatureExtractor"]
+
+
+@runtime_checkable
+class FeatureExtractor(Protocol):
+    """Turns an image into one feature vector per grid cell.
+
+    Attributes:
+        dim: number of channels C; 0 for the extractor `none`.
+    """
+
+    dim: int
+
+    def extract(self, image: Tensor, grid: Grid) -> Tensor:
+        """Features sampled at the pixel centres of the grid's cells.
+
+        Args:
+            image: [3,H,W] float32 in [0,1], RGB, at working size.
+            grid: where to sample; cell (x, y) lies at pixel `stride * (x, y) + offset`.
+        Returns:
+            [C,h,w] float32 or float16, finite, on the device of `image`; raw, not normalised.
+        """
+        ...

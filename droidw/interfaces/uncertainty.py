@@ -1,0 +1,96 @@
+"""Uncertainty models: which pixels cannot be trusted to be static."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["StoreField", "UncertaintyModel", "UncertaintyReport", "UncertaintyView"]
+
+
+@dataclass(frozen=True)
+class StoreField:
+    """A tensor that a part wants to keep per keyframe; it moves and dies with the keyframe.
+
+    Attributes:
+        name: unique within the store.
+        shape: per keyframe, in which "h", "w" and "c" stand for the grid and the feature size.
+        fill: initial value.
+        dtype: name of a torch dtype.
+    """
+
+    name: str
+    shape: tuple[int | str, ...]
+    fill: float = 0.0
+    dtype: str = "float32"
+
+
+@dataclass(frozen=True)
+class UncertaintyView:
+    """What a model may see: views into the keyframe store and the current edges.
+
+    Attributes:
+        features: [N,c,h,w], may be half precision; c is 0 with extractor `none`.
+        uncertainty: [N,h,w] float32; the model's output, written in place.
+        fields: the model's own `StoreField`s by name, [N,...], written in place.
+        T_cw: [N,7] world to camera. disps: [N,h,w]. intrinsics: [4] of the grid.
+        ii, jj: [E] int64 edges given to this bundle adjustment call.
+        target: [E,h,w,2] measured correspondence in cells; confidence: [E,h,w,2].
+        frames: [K] int64 keyframes whose maps are to be refreshed.
+        iteration: counts updates since the start of the run.
+    """
+
+    features: Tensor
+    uncertainty: Tensor
+    fields: Mapping[str, Tensor]
+    T_cw: Tensor
+    disps: Tensor
+    intrinsics: Tensor
+    ii: Tensor
+    jj: Tensor
+    target: Tensor
+    confidence: Tensor
+    frames: Tensor
+    iteration: int = 0
+
+
+@dataclass(frozen=True)
+class UncertaintyReport:
+    """Facts of one update: energy before the step and whatever else the model measures."""
+
+    energy: float = 0.0
+    facts: dict[str, float] = field(default_factory=dict)
+
+
+@runtime_checkable
+class UncertaintyModel(Protocol):
+    """Maps evidence to an uncertainty u >= 0 per cell; the core's gate turns u into a weight.
+
+    Attributes:
+        fields: tensors that the model keeps per keyframe.
+    """
+
+    fields: tuple[StoreField, ...]
+
+    def append(self, view: UncertaintyView, index: int) -> None:
+        """Write `view.uncertainty[index]` (and own fields) for a keyframe just appended.
+
+        `view.ii`, `jj`, `target` and `confidence` are empty here.
+        """
+        ...
+
+    def update(self, view: UncertaintyView) -> UncertaintyReport:
+        """One step of the model on these edges; refreshes the maps of `view.frames`."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """What is global to the model (parameters), for checkpoints and the manifest."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore `state_dict()`."""
+        ...

@@ -1,0 +1,74 @@
+"""`Component`: the description by which a plugin offers one part."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+if TYPE_CHECKING:
+    import torch
+
+T = TypeVar("T")
+
+__all__ = ["BuildContext", "Component", "NoOptions"]
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """Options of a component that has none."""
+
+
+@dataclass(frozen=True)
+class BuildContext:
+    """What a factory may know of the run that it builds for.
+
+    Attributes:
+        device: where tensors of the run live.
+        seed: seed of the run; a component that draws numbers makes its own generator from it.
+        weights_dir: folder of downloaded weights, or None where none was set up.
+        run_dir: the run folder, or None in tests; the only place where a component may write.
+        compat: names of published behaviours asked for, such as "droid-w".
+    """
+
+    device: torch.device
+    seed: int = 0
+    weights_dir: Path | None = None
+    run_dir: Path | None = None
+    compat: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Component(Generic[T]):
+    """A named part that a plugin offers; frozen, and cheap to make.
+
+    Making one must not import anything heavy: the factory does that when the part is chosen.
+
+    Attributes:
+        name: lower-case kebab, unique within its kind, e.g. "affine-softplus".
+        summary: one line for `droidw list-plugins`.
+        factory: called as `factory(options, context)`; `options` is an instance of `options`.
+        options: dataclass in which every field has a default; unknown keys are refused. The
+            text for `list-plugins --options` comes from `field(metadata={"help": ...})`.
+        requires: import names that must be importable, checked without importing them.
+        extra: the extra that installs what `requires` names, e.g. "open3d".
+        weights: names of weights files that must be on disk (`droidw weights list`).
+        capabilities: facts that the host checks before a run: "cpu", "cuda" (devices it runs
+            on), "features" (an uncertainty model that needs features, an extractor that gives
+            them), "depth" (a depth prior that gives depth).
+        reference: paper, equation or table row, and the licence of code and weights.
+        available: None, or a check that returns "" when the part can run here and a short
+            reason such as "no GPU visible" when not; it may be slow and is called lazily.
+    """
+
+    name: str
+    summary: str
+    factory: Callable[[Any, BuildContext], T]
+    options: type = NoOptions
+    requires: tuple[str, ...] = ()
+    extra: str | None = None
+    weights: tuple[str, ...] = ()
+    capabilities: frozenset[str] = frozenset({"cpu"})
+    reference: str = ""
+    available: Callable[[], str] | None = field(default=None, compare=False)

@@ -1,0 +1,89 @@
+"""The bundle adjustment problem as data: what a backend gets and what it returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["BAProblem", "Report", "Step"]
+
+
+@dataclass(frozen=True)
+class BAProblem:
+    """Weighted dense bundle adjustment over E directed edges i -> j (REFERENCE 3).
+
+    Energy: sum over edges, cells and x/y of `weight * rho(target - projection)^2`, plus
+    `prior_weight * (disp - prior)^2` where `prior > 0`, plus `damping * step^2` elsewhere.
+
+    Attributes:
+        T_cw: [N,7] world to camera, translation then unit quaternion xyzw.
+        disps: [N,h,w] inverse depth, 1/scene-unit, on the grid.
+        intrinsics: [4] fx fy cx cy of the grid.
+        ii, jj: [E] int64.
+        target: [E,h,w,2] measured position of cell of i in j, cells.
+        weight: [E,h,w,2] >= 0: confidence x uncertainty x validity, all factors in.
+        fixed: [N] bool, poses that must not move. Poses without an edge do not move either.
+        damping: [N,h,w] added to the depth diagonal where there is no prior.
+        prior: [N,h,w] inverse depth of a depth prior, 0 where there is none; or None.
+        prior_weight: gamma_d of REFERENCE 3.2.
+        motion_only: move poses, leave depths.
+        lm, ep: diag(S) <- diag(S) * (1 + lm) + ep on the reduced system.
+        huber: threshold in cells of a Huber kernel on the residual length, or None.
+        min_disp, max_disp: bounds of the disparity after the step (max None: unbounded).
+        guard: evaluate the energy after the step; shorten the step while it rose, and reject it
+            if no shorter one lowers the energy.
+    """
+
+    T_cw: Tensor
+    disps: Tensor
+    intrinsics: Tensor
+    ii: Tensor
+    jj: Tensor
+    target: Tensor
+    weight: Tensor
+    fixed: Tensor
+    damping: Tensor
+    prior: Tensor | None = None
+    prior_weight: float = 0.0
+    motion_only: bool = False
+    lm: float = 1e-4
+    ep: float = 0.1
+    huber: float | None = None
+    min_disp: float = 1e-5
+    max_disp: float | None = None
+    guard: bool = False
+
+
+@dataclass(frozen=True)
+class Report:
+    """How a step went.
+
+    Attributes:
+        status: "ok"; "rejected" (no step lowered the energy); "singular" (the reduced system
+            could not be factorised); "nonfinite" (NaN or inf in the solution); "empty"
+            (nothing to move). In all but "ok" the step returns its input unchanged.
+        cost_before: energy at the start.
+        cost_after: energy after the step, NaN unless `guard`.
+        step_norm: largest pose update, tangent norm.
+        dropped: measurements left out because target or weight was not finite.
+        isolated: free poses without any usable measurement; they were held.
+    """
+
+    status: Literal["ok", "rejected", "singular", "nonfinite", "empty"]
+    cost_before: float
+    cost_after: float = float("nan")
+    step_norm: float = 0.0
+    dropped: int = 0
+    isolated: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Step:
+    """New poses [N,7] and disparities [N,h,w] (fresh tensors), and the report."""
+
+    T_cw: Tensor
+    disps: Tensor
+    report: Report
