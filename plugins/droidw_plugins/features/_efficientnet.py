@@ -3,9 +3,9 @@
 Architecture: Tan and Le, "EfficientNet", 2019, in the "Lite" form (ReLU6, no squeeze-excitation).
 Batch normalisation is folded into the convolutions when the weights are read.
 
-Padding: the published network pads stride-2 convolutions at the bottom and right only, which puts
-feature cell k of stride s at pixel `s*k + s - 1`. Here every convolution pads by (kernel - 1)/2 on
-all sides: the same filters at another phase, and cell k lies exactly at pixel `s*k`.
+Padding: every convolution pads by (kernel - 1)/2 on all sides, as these weights were trained (the
+asymmetric padding of the TensorFlow original loses the right class on test pictures). Feature cell
+k of stride s therefore lies exactly at pixel `s*k`.
 """
 
 from __future__ import annotations
