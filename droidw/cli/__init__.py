@@ -1,1 +1,1 @@
-
+"""The command line: one thin module per verb, loaded when the verb is used."""

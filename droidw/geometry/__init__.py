@@ -1,1 +1,1 @@
-
+"""Geometry: poses, cameras, projection, alignment; the lowest layer."""

@@ -1,1 +1,1 @@
-
+"""The keyframe store and the graph of edges between keyframes."""

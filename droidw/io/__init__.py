@@ -1,1 +1,1 @@
-
+"""Reading and writing trajectories, video and weights."""

@@ -1,1 +1,1 @@
-
+"""What bundle adjustment is asked to solve, and the weights of its residuals."""

@@ -1,0 +1,1 @@
+"""The configuration files that come with droidw: base, presets, datasets and ablations."""
