@@ -1,1 +1,1 @@
-"""Plugins: what they declare, how they are found, and the registries they fill."""
+"""How parts come in: hooks, components, the manager that loads plugins, and the registries."""

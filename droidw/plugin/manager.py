@@ -1,0 +1,401 @@
+"""Finding plugins and loading them one by one, so that a broken one harms nobody else.
+
+pluggy holds the hooks, checks their arguments and refuses unknown ones; what is added here is
+isolation, provenance, the load and block lists, and checks of what the hooks return.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import logging
+import os
+import re
+import sys
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import metadata, util
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pluggy
+
+from droidw.errors import PluginError, UsageError
+from droidw.plugin import hookspecs
+from droidw.plugin.component import Component
+from droidw.plugin.registry import KINDS, Entry, Failure, Registry, nearest
+
+__all__ = ["DISABLE_VARIABLE", "GROUP", "HOST", "LOAD_VARIABLE", "Plugins", "load_plugins",
+           "register"]
+
+GROUP = "droidw"
+"""Entry-point group in which plugins are found."""
+
+HOST = "droidw"
+"""The distribution whose own plugins are loaded whatever `DROIDW_LOAD_PLUGINS` says."""
+
+LOAD_VARIABLE = "DROIDW_LOAD_PLUGINS"
+DISABLE_VARIABLE = "DROIDW_DISABLE_PLUGINS"
+WEIGHTS_VARIABLE = "DROIDW_WEIGHTS"
+
+_NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
+_HOOKS = {kind.hook: kind.name for kind in KINDS.values()}
+_log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Origin:
+    plugin: str
+    distribution: str
+    version: str
+
+
+class Plugins:
+    """All plugins of a process, as far as they could be loaded.
+
+    Args:
+        environ: where `DROIDW_DISABLE_PLUGINS` and `DROIDW_WEIGHTS` are looked up.
+
+    Attributes:
+        failures: what could not be loaded and why, in the order of loading.
+        weights_dir: folder in which weights files are looked for.
+    """
+
+    def __init__(self, environ: Mapping[str, str] = os.environ) -> None:
+        self.failures: list[Failure] = []
+        self.weights_dir = _weights_dir(environ)
+        self._blocked = frozenset(_split(environ.get(DISABLE_VARIABLE, "")))
+        self._entries: list[Entry] = []
+        self._manager = pluggy.PluginManager(hookspecs.PROJECT)
+        self._manager.add_hookspecs(hookspecs)
+
+    def registry(self, kind: str) -> Registry:
+        """The parts of one kind, a key of `droidw.plugin.registry.KINDS`.
+
+        Raises:
+            UsageError: there is no such kind.
+        """
+        if kind not in KINDS:
+            near = nearest(kind, KINDS)
+            raise UsageError(
+                f"there is no kind of plugin called '{kind}'",
+                (f"did you mean '{near}'?   " if near else "") + "kinds: " + ", ".join(KINDS),
+            )
+        entries = [e for e in self._entries if e.kind == kind]
+        blocked = {
+            e.component.name
+            for e in entries
+            if self._blocked & {e.component.name, f"{kind}/{e.component.name}"}
+        }
+        return Registry(
+            KINDS[kind], entries, frozenset(blocked), tuple(self.failures), self.weights_dir
+        )
+
+    def entries(self) -> list[Entry]:
+        """Every component of every kind, in the order of loading."""
+        return list(self._entries)
+
+    def register(self, plugin: object, name: str | None = None) -> None:
+        """Add a module or object whose functions are marked `@droidw.hookimpl`.
+
+        Raises:
+            PluginError: it breaks a contract, or its name is taken; nothing of it is kept.
+        """
+        label = name or getattr(plugin, "__name__", None) or type(plugin).__name__
+        failure = self._register(plugin, _Origin(str(label), "registered from Python", ""))
+        if failure is not None:
+            raise _raised(failure)
+
+    def add(self, kind: str, component: Component[Any]) -> None:
+        """Add one component of a kind, without a hook.
+
+        Raises:
+            UsageError: there is no such kind.
+            PluginError: the component breaks a contract.
+        """
+        self.registry(kind)
+        origin = _Origin(getattr(component, "name", "?"), "registered from Python", "")
+        problem = _problem(component)
+        if problem:
+            raise PluginError(f"a component of kind '{kind}' {problem}")
+        self._entries.append(
+            Entry(kind, component, origin.plugin, origin.distribution, origin.version)
+        )
+
+    def check(self) -> None:
+        """Raise the first thing that is wrong with any plugin (`--strict-plugins`).
+
+        Raises:
+            PluginError: a plugin did not load, or two offer the same name.
+        """
+        if self.failures:
+            raise _raised(self.failures[0])
+        for kind in KINDS:
+            registry = self.registry(kind)
+            for name in registry.names():
+                if len(registry.providers(name)) > 1:
+                    registry.entry(name)
+
+    def load_entry_points(self, only: frozenset[str] | None) -> None:
+        """Load what installed distributions offer; `only` limits the third-party ones."""
+        found_host = False
+        points = sorted(metadata.entry_points(group=GROUP), key=lambda p: (_dist(p), p.name))
+        for point in points:
+            distribution, version = _dist(point)
+            host = _normal(distribution) == HOST
+            found_host = found_host or host
+            if only is not None and not host and _normal(distribution) not in only:
+                continue
+            if self._blocked & {point.name, distribution, _normal(distribution)}:
+                continue
+            self._load(_Origin(point.name, distribution, version), point.load)
+        if not found_host:
+            self._fail(
+                _Origin(HOST, HOST, "not installed"),
+                "droidw runs from a bare source tree, so its own plugins are not registered; "
+                "install it: pip install -e .",
+            )
+
+    def load_file(self, path: Path) -> Failure | None:
+        """Load a plugin from a Python file; returns the failure, which is listed as well.
+
+        Raises:
+            UsageError: there is no such file.
+        """
+        if not path.is_file():
+            raise UsageError(
+                f"--plugin {path}: there is no such file", "give the path of a Python file"
+            )
+        return self._load(_Origin(path.stem, str(path), ""), lambda: _import_file(path))
+
+    def _load(self, origin: _Origin, load: Callable[[], object]) -> Failure | None:
+        try:
+            plugin = load()
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - strangers' code
+            return self._fail(origin, f"{type(error).__name__}: {error}", _trace(error))
+        return self._register(plugin, origin)
+
+    def _register(self, plugin: object, origin: _Origin) -> Failure | None:
+        """Hand a plugin to pluggy, ask its hooks, check the answers; all of it or nothing."""
+        try:
+            self._manager.register(plugin, name=f"{origin.distribution}:{origin.plugin}")
+            self._manager.check_pending()
+            entries = self._collect(plugin, origin)
+        except pluggy.PluginValidationError as error:
+            self._drop(plugin)
+            return self._fail(origin, _explain(error))
+        except PluginError as error:
+            self._drop(plugin)
+            return self._fail(origin, str(error))
+        except ValueError as error:  # pluggy: the same plugin or name a second time
+            return self._fail(origin, f"it is registered already ({error})")
+        except Exception as error:  # noqa: BLE001 - strangers' code
+            self._drop(plugin)
+            return self._fail(origin, f"{type(error).__name__}: {error}", _trace(error))
+        self._entries.extend(entries)
+        return None
+
+    def _collect(self, plugin: object, origin: _Origin) -> list[Entry]:
+        entries: list[Entry] = []
+        callers = self._manager.get_hookcallers(plugin) or []
+        for caller in callers:
+            for impl in caller.get_hookimpls():
+                if impl.plugin is not plugin:
+                    continue
+                if impl.hookwrapper or impl.wrapper:
+                    raise PluginError(f"{caller.name}: a hook of droidw cannot be wrapped")
+                answer = impl.function()
+                entries.extend(
+                    Entry(_HOOKS[caller.name], component, origin.plugin, origin.distribution,
+                          origin.version)
+                    for component in _components(caller.name, answer)
+                )
+        if not callers:
+            raise PluginError(
+                "it offers nothing: no function in it is marked with @droidw.hookimpl",
+                "hooks: " + ", ".join(_HOOKS),
+            )
+        return entries
+
+    def _drop(self, plugin: object) -> None:
+        if self._manager.is_registered(plugin):
+            self._manager.unregister(plugin)
+
+    def _fail(self, origin: _Origin, error: str, trace: str = "") -> Failure:
+        failure = Failure(origin.plugin, origin.distribution, origin.version, error, trace)
+        self.failures.append(failure)
+        _log.debug("plugin %s of %s did not load: %s", failure.name, failure.origin, error)
+        return failure
+
+
+def load_plugins(
+    files: Sequence[str | Path] = (),
+    environ: Mapping[str, str] = os.environ,
+    extra: Iterable[object] = (),
+    *,
+    strict: bool = False,
+    tolerant: bool = False,
+) -> Plugins:
+    """Load installed plugins, then files, then objects.
+
+    A broken installed plugin is kept in `Plugins.failures` and harms nobody else. A file or
+    object was asked for by name, so its failure is raised, unless `tolerant`.
+
+    Args:
+        files: Python files, as `--plugin` gives them.
+        environ: `DROIDW_LOAD_PLUGINS` (comma list of third-party distributions to load; empty
+            for none) and `DROIDW_DISABLE_PLUGINS` (comma list of plugins, distributions and
+            components, the latter also as `kind/name`).
+        extra: modules or objects with functions marked `@droidw.hookimpl`.
+        strict: raise the first failure or clash at once.
+        tolerant: list failures of `files`, too, instead of raising them.
+    Raises:
+        UsageError: a file does not exist.
+        PluginError: a file or object could not be loaded, or `strict` found something.
+    """
+    plugins = Plugins(environ)
+    wanted = environ.get(LOAD_VARIABLE)
+    only = None if wanted is None else frozenset(_normal(n) for n in _split(wanted))
+    plugins.load_entry_points(only)
+    for file in files:
+        failure = plugins.load_file(Path(file))
+        if failure is not None and not tolerant:
+            raise _raised(failure)
+    for item in extra:
+        plugins.register(item)
+    if strict:
+        plugins.check()
+    return plugins
+
+
+def register(
+    *things: object, to: Plugins | None = None, **components: Component[Any]
+) -> Plugins:
+    """Bring one's own parts from Python.
+
+    Args:
+        things: modules or objects with functions marked `@droidw.hookimpl`.
+        to: plugins to add to; all installed ones are loaded if not given.
+        components: single components by kind, e.g. `features=Component(...)`.
+    Returns:
+        The plugins to run with; nothing is kept anywhere else.
+    Raises:
+        UsageError, PluginError: as `Plugins.register` and `Plugins.add`.
+
+    Example::
+
+        plugins = droidw.register(my_module, features=my_component)
+    """
+    plugins = load_plugins() if to is None else to
+    for thing in things:
+        plugins.register(thing)
+    for kind, component in components.items():
+        plugins.add(kind, component)
+    return plugins
+
+
+def _components(hook: str, answer: object) -> list[Component[Any]]:
+    """Check what a hook returned."""
+    if isinstance(answer, (Component, str, bytes)) or not isinstance(answer, Iterable):
+        raise PluginError(
+            f"{hook} returned {_described(answer)}; it must yield Component records "
+            "(write `yield droidw.Component(...)`)"
+        )
+    found: list[Component[Any]] = []
+    for item in answer:
+        problem = _problem(item)
+        if problem:
+            raise PluginError(f"{hook}: {problem}")
+        if any(item.name == other.name for other in found):
+            raise PluginError(f"{hook} yielded two components called '{item.name}'")
+        found.append(item)
+    return found
+
+
+def _problem(item: Any) -> str:
+    """What is wrong with a component, or ""."""
+    if not isinstance(item, Component):
+        return f"yielded {_described(item)} where a droidw.Component is expected"
+    if not isinstance(item.name, str) or not _NAME.fullmatch(item.name):
+        return f"the name {item.name!r} is not lower-case kebab, such as 'my-part'"
+    if not callable(item.factory):
+        return f"'{item.name}': factory is {_described(item.factory)}, not callable"
+    if not isinstance(item.options, type) or not dataclasses.is_dataclass(item.options):
+        return f"'{item.name}': options is {_described(item.options)}, not a dataclass"
+    for entry in dataclasses.fields(item.options):
+        missing = dataclasses.MISSING
+        if entry.default is missing and entry.default_factory is missing:
+            return f"'{item.name}': option '{entry.name}' has no default"
+    for attribute in ("requires", "weights", "capabilities"):
+        value = getattr(item, attribute)
+        if isinstance(value, str) or not all(isinstance(part, str) for part in value):
+            return f"'{item.name}': {attribute} is {value!r}, not a collection of strings"
+    return ""
+
+
+def _described(value: object) -> str:
+    return "nothing (None)" if value is None else f"a {type(value).__name__} ({value!r})"
+
+
+def _explain(error: pluggy.PluginValidationError) -> str:
+    """pluggy's complaint as one line, with the nearest hook if the name is unknown."""
+    text = " ".join(str(error).split())
+    match = re.search(r"unknown hook '(\w+)'", text)
+    if not match:
+        return text
+    near = nearest(match[1], _HOOKS)
+    return f"unknown hook '{match[1]}'" + (
+        f"; did you mean '{near}'?" if near else "; hooks: " + ", ".join(_HOOKS)
+    )
+
+
+def _raised(failure: Failure) -> PluginError:
+    return PluginError(
+        f"plugin '{failure.name}' ({failure.origin}) failed to load: {failure.error}",
+        failure.traceback and f"see: droidw list-plugins --traceback {failure.name}",
+    )
+
+
+def _trace(error: BaseException) -> str:
+    return "".join(traceback.format_exception(type(error), error, error.__traceback__))
+
+
+def _import_file(path: Path) -> ModuleType:
+    digest = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
+    name = f"_droidw_plugin_{digest}_{re.sub(r'[^0-9a-zA-Z_]', '_', path.stem)}"
+    spec = util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} is not a Python file (its name must end in .py)")
+    module = util.module_from_spec(spec)
+    # dataclasses look their module up there while the file is executed
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _dist(point: metadata.EntryPoint) -> tuple[str, str]:
+    distribution = getattr(point, "dist", None)
+    if distribution is None:
+        return ("unknown distribution", "")
+    return (str(distribution.metadata["Name"]), str(distribution.version))
+
+
+def _weights_dir(environ: Mapping[str, str]) -> Path:
+    if environ.get(WEIGHTS_VARIABLE):
+        return Path(environ[WEIGHTS_VARIABLE]).expanduser()
+    cache = environ.get("XDG_CACHE_HOME")
+    return (Path(cache) if cache else Path.home() / ".cache") / "droidw" / "weights"
+
+
+def _split(text: str) -> list[str]:
+    return [part.strip() for part in text.split(",") if part.strip()]
+
+
+def _normal(name: str) -> str:
+    """A distribution's name as package indexes compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
