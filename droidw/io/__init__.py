@@ -1,1 +1,1 @@
-"""Reading and writing trajectories, video and weights."""
+"""Files in and out: trajectories, calibrations, pictures and videos."""

@@ -1,0 +1,37 @@
+"""Decoding ahead in a thread of its own."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
+
+T = TypeVar("T")
+
+__all__ = ["prefetch"]
+
+
+def prefetch(items: Iterable[T], ahead: int = 4) -> Generator[T, None, None]:
+    """Yield `items` in order while a thread prepares up to `ahead` more.
+
+    What the source raises is raised here, at its place in the order. When the generator is
+    closed or dropped, the thread ends and the source, if it is a generator, is closed.
+    """
+    source = iter(items)
+    end = object()
+    worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="droidw-prefetch")
+    waiting: deque[Future[object]] = deque()
+    try:
+        for _ in range(ahead):
+            waiting.append(worker.submit(next, source, end))
+        while True:
+            item = waiting.popleft().result()
+            if item is end:
+                return
+            waiting.append(worker.submit(next, source, end))
+            yield item  # type: ignore[misc] - everything but `end` is a T
+    finally:
+        worker.shutdown(wait=True, cancel_futures=True)
+        if isinstance(source, Generator):
+            source.close()

@@ -1,0 +1,105 @@
+"""Trajectories in the TUM format: `t tx ty tz qx qy qz qw`, seconds, camera to world."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from droidw.errors import InputError
+from droidw.io.files import atomic_write, read_text
+from droidw.slam.frame import Trajectory
+
+__all__ = ["read_tum", "write_tum"]
+
+_HEADER = "# timestamp tx ty tz qx qy qz qw (seconds, camera to world, OpenCV axes)\n"
+_VALID = "a row is `timestamp tx ty tz qx qy qz qw`, camera to world, times strictly rising"
+_SHOWN = 5
+
+
+def read_tum(path: Path | str, *, problems: list[str] | None = None) -> Trajectory:
+    """Read a trajectory; comments start with #, columns are parted by blanks or commas.
+
+    Quaternions within 5 % of unit length are made unit.
+
+    Args:
+        path: the file.
+        problems: None to refuse a bad row; a list to skip bad rows, each with a sentence
+            appended (the first few alone, the rest counted).
+    Raises:
+        InputError: the file is missing or no text, a row is bad (with its line number), or no
+            row is left.
+    """
+    path = Path(path)
+    rows: list[list[float]] = []
+    bad: list[str] = []
+    last = -math.inf
+    for number, line in enumerate(read_text(path, "a trajectory in TUM format").splitlines(), 1):
+        fields = line.split("#", 1)[0].replace(",", " ").split()
+        if not fields:
+            continue
+        row, fault = _parse(fields)
+        if not fault and row[0] <= last:
+            relation = "repeats" if row[0] == last else "runs backwards from"
+            fault = f"time stamp {row[0]!r} {relation} {last!r}"
+        if fault:
+            if problems is None:
+                raise InputError(f"{path}, line {number}: {fault}", _VALID)
+            bad.append(f"{path.name}, line {number}: {fault}; row skipped")
+            continue
+        last = row[0]
+        rows.append(row)
+    if problems is not None:
+        problems.extend(bad[:_SHOWN])
+        if len(bad) > _SHOWN:
+            problems.append(f"{path.name}: {len(bad) - _SHOWN} more bad rows skipped")
+    if not rows:
+        raise InputError(f"{path} holds no pose", _VALID)
+    table = np.array(rows, dtype=np.float64)
+    table[:, 4:] /= np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
+    return Trajectory(times=table[:, 0].copy(), T_wc=table[:, 1:].copy())
+
+
+def _parse(fields: list[str]) -> tuple[list[float], str]:
+    """Numbers of one row and what is wrong with it ("" if nothing)."""
+    if len(fields) != 8:
+        return [], f"{len(fields)} columns, expected 8"
+    row: list[float] = []
+    for text in fields:
+        try:
+            row.append(float(text))
+        except ValueError:
+            return [], f"'{text}' is not a number"
+        if not math.isfinite(row[-1]):
+            return [], f"'{text}' is not a finite number"
+    norm = math.hypot(*row[4:])
+    if abs(norm - 1.0) > 0.05:
+        return [], f"the quaternion has length {norm:.3g}, not 1"
+    return row, ""
+
+
+def write_tum(path: Path | str, trajectory: Trajectory, *, header: bool = True) -> None:
+    """Write a trajectory: exactly 8 columns, the same bytes for the same numbers.
+
+    Times keep every digit of their float64, values have 9 significant digits. The file appears
+    whole or not at all.
+
+    Args:
+        path: the file to write; an existing one is replaced.
+        trajectory: T_wc [N,7], times [N] in seconds.
+        header: begin with a comment line that names the columns.
+    Raises:
+        ValueError: a value is not finite.
+        UsageError: the file cannot be written.
+    """
+    if not (np.isfinite(trajectory.times).all() and np.isfinite(trajectory.T_wc).all()):
+        raise ValueError("a trajectory with values that are not finite cannot be written")
+    lines = [_HEADER] if header else []
+    for time, pose in zip(trajectory.times, trajectory.T_wc, strict=True):
+        stamp = np.format_float_positional(time, unique=True, trim="k", min_digits=6)
+        # Adding zero turns -0.0 into 0.0.
+        values = " ".join(f"{value + 0.0:.9g}" for value in pose.tolist())
+        lines.append(f"{stamp} {values}\n")
+    with atomic_write(Path(path)) as stream:
+        stream.write("".join(lines).encode("ascii"))

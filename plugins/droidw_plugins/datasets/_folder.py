@@ -1,0 +1,127 @@
+"""Opening a folder of pictures."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from statistics import median
+
+from droidw.errors import InputError
+from droidw.interfaces.datasets import Selection
+from droidw.io.calib import read_calibration
+from droidw.io.images import IMAGE_SUFFIXES, list_images
+from droidw.io.tum import read_tum
+from droidw.slam.frame import Trajectory
+from droidw_plugins.datasets._layout import VIDEO_SUFFIXES, looks_like_tum
+from droidw_plugins.datasets._listing import (
+    Entry,
+    ListedSource,
+    Notes,
+    keep_rising,
+    read_listing,
+)
+
+__all__ = ["FolderReader", "read_truth"]
+
+_SUBFOLDERS = ("rgb", "images")
+_EXPECTED = (
+    "expected pictures (" + ", ".join(sorted(s[1:] for s in IMAGE_SUFFIXES)) + ") right in the "
+    "folder or in rgb/ or images/ in it, or a list rgb.txt with lines `timestamp filename`"
+)
+
+
+class FolderReader:
+    """A `DatasetReader` for pictures in a folder.
+
+    Args:
+        fps: assumed where neither `rgb.txt` nor the file names tell the times.
+    """
+
+    def __init__(self, fps: float = 30.0) -> None:
+        self._fps = fps
+
+    def recognises(self, source: str) -> bool:
+        """Whether it is a folder with pictures, or one with no other folder in it."""
+        path = Path(source)
+        if not path.is_dir() or looks_like_tum(path):
+            return False
+        if (path / "rgb.txt").is_file() or _picture_folder(path) is not None:
+            return True
+        return not any(entry.is_dir() for entry in path.iterdir())
+
+    def open(self, source: str, selection: Selection) -> ListedSource:
+        """Open the folder; see `DatasetReader.open`."""
+        path = _existing(source)
+        problems: list[str] = []
+        notes = Notes(problems)
+        if (path / "rgb.txt").is_file():
+            entries, skipped = read_listing(path / "rgb.txt", notes)
+            rising = keep_rising(entries, notes)
+            skipped += len(entries) - len(rising)
+        else:
+            rising, skipped = self._unlisted(path, problems), 0
+        notes.finish()
+        out = ListedSource(path.resolve().name, rising, selection, problems, skipped)
+        if (path / "camera.txt").is_file():
+            out.camera, note = read_calibration(path / "camera.txt", *out.size)
+            problems.extend([note] if note else [])
+        out.truth = read_truth(path / "groundtruth.txt", problems)
+        return out
+
+    def _unlisted(self, path: Path, problems: list[str]) -> list[Entry]:
+        folder = _picture_folder(path)
+        if folder is None:
+            videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
+            hint = f"did you mean: droidw run {videos[0]}" if videos else _EXPECTED
+            raise InputError(f"there is no picture in {path}", hint)
+        files = list_images(folder)
+        times = _times_in_names(files)
+        if times is not None:
+            order = sorted(range(len(files)), key=lambda i: times[i])
+            return [(n, times[i], files[i]) for n, i in enumerate(order)]
+        problems.append(
+            f"{folder} does not say when its pictures were taken: "
+            f"{self._fps:g} a second assumed (reader.options.fps)"
+        )
+        return [(n, n / self._fps, file) for n, file in enumerate(files)]
+
+
+def _existing(source: str) -> Path:
+    path = Path(source)
+    if not path.exists():
+        raise InputError(f"{source}: no such folder", _EXPECTED)
+    if not path.is_dir():
+        raise InputError(f"{source} is not a folder", _EXPECTED)
+    return path
+
+
+def _picture_folder(path: Path) -> Path | None:
+    """The folder itself or the one in it that has the pictures."""
+    for folder in (path, *(path / name for name in _SUBFOLDERS)):
+        if folder.is_dir() and list_images(folder):
+            return folder
+    return None
+
+
+def _times_in_names(files: list[Path]) -> list[float] | None:
+    """Times in seconds, if all names are decimal numbers that look like them.
+
+    They do if no two are the same and their usual distance is between 1 ms and 2 s.
+    """
+    if len(files) < 2 or not all(re.fullmatch(r"\d+\.\d+", file.stem) for file in files):
+        return None
+    times = [float(file.stem) for file in files]
+    rising = sorted(times)
+    gaps = [b - a for a, b in zip(rising[:-1], rising[1:], strict=True)]
+    return times if min(gaps) > 0 and 0.001 <= median(gaps) <= 2.0 else None
+
+
+def read_truth(path: Path, problems: list[str]) -> Trajectory | None:
+    """Ground truth if there is a usable one; it is only scored, so that no fault is fatal."""
+    if not path.is_file():
+        return None
+    try:
+        return read_tum(path, problems=problems)
+    except InputError as error:
+        problems.append(f"{error.message}; the run is not scored")
+        return None

@@ -1,0 +1,230 @@
+"""Footage that is a list of picture files with times: shared by the readers of folders."""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections import Counter
+from collections.abc import Generator, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from droidw.errors import InputError
+from droidw.io.files import read_text
+from droidw.io.images import read_image
+from droidw.io.prefetch import prefetch
+from droidw.slam.frame import RawFrame, Trajectory
+
+if TYPE_CHECKING:
+    from droidw.geometry.camera import Camera
+    from droidw.interfaces.datasets import Selection
+
+__all__ = ["Entry", "ListedSource", "Notes", "keep_rising", "read_listing"]
+
+Entry = tuple[int, float, Path]
+_SHOWN = 5
+_PROBES = 5
+
+
+class Notes:
+    """Collects sentences, the first few of a kind as they are and the rest as a count.
+
+    Args:
+        problems: the list that receives the sentences.
+    """
+
+    def __init__(self, problems: list[str]) -> None:
+        self._problems = problems
+        self._counts: Counter[str] = Counter()
+
+    def add(self, kind: str, sentence: str) -> None:
+        """Note one case of `kind` ("pictures that cannot be decoded")."""
+        self._counts[kind] += 1
+        if self._counts[kind] <= _SHOWN:
+            self._problems.append(sentence)
+
+    def finish(self) -> None:
+        """Say how many of each kind were not listed one by one."""
+        for kind, count in self._counts.items():
+            if count > _SHOWN:
+                self._problems.append(f"{count - _SHOWN} more {kind}")
+        self._counts.clear()
+
+
+def read_listing(path: Path, notes: Notes) -> tuple[list[Entry], int]:
+    """Read `timestamp filename` lines; comments start with #.
+
+    Lines without a usable time or name are noted and count as skipped pictures.
+
+    Args:
+        path: the list; names in it are relative to its folder.
+        notes: receives a sentence per bad line.
+    Returns:
+        Entries with the position among all lines that are not comments, and how many were
+        skipped.
+    Raises:
+        InputError: the file cannot be read or has no usable line.
+    """
+    entries: list[Entry] = []
+    position = 0
+    for number, line in enumerate(read_text(path, "lines `timestamp filename`").splitlines(), 1):
+        fields = line.split("#", 1)[0].replace(",", " ").split(maxsplit=1)
+        if not fields:
+            continue
+        fault = ""
+        try:
+            time = float(fields[0])
+        except ValueError:
+            fault = f"'{fields[0]}' is not a time in seconds"
+        else:
+            if not math.isfinite(time):
+                fault = f"'{fields[0]}' is not a time in seconds"
+        if not fault and len(fields) < 2:
+            fault = "no file name after the time"
+        if fault:
+            notes.add(
+                f"bad lines in {path.name}", f"{path.name}, line {number}: {fault}, skipped"
+            )
+        else:
+            entries.append((position, time, path.parent / fields[1].strip()))
+        position += 1
+    if not entries:
+        raise InputError(
+            f"{path} names no picture", "lines look like `1.033333 rgb/000031.jpg`"
+        )
+    return entries, position - len(entries)
+
+
+def keep_rising(entries: Sequence[Entry], notes: Notes) -> list[Entry]:
+    """The longest part of the entries whose times strictly rise.
+
+    Pictures whose time repeats or runs backwards are left out and noted; taking the longest
+    part keeps a single stray time far in the future from costing all that follows.
+    """
+    tails: list[int] = []
+    times: list[float] = []
+    before: list[int] = [-1] * len(entries)
+    for i, (_, time, _) in enumerate(entries):
+        at = bisect.bisect_left(times, time)
+        before[i] = tails[at - 1] if at else -1
+        if at == len(times):
+            times.append(time)
+            tails.append(i)
+        elif time < times[at]:
+            times[at] = time
+            tails[at] = i
+    kept: set[int] = set()
+    i = tails[-1] if tails else -1
+    while i >= 0:
+        kept.add(i)
+        i = before[i]
+    for i, (_, time, path) in enumerate(entries):
+        if i not in kept:
+            notes.add(
+                "pictures with a time that repeats or runs backwards",
+                f"{path.name}: its time {time!r} s repeats or runs backwards, skipped",
+            )
+    return [entry for i, entry in enumerate(entries) if i in kept]
+
+
+class ListedSource:
+    """A `FrameSource` over picture files.
+
+    Args:
+        name: label of the source.
+        entries: (index, time in s, file), times strictly rising.
+        selection: which of them to take.
+        problems: sentences so far; grows during the first pass.
+        skipped: pictures that were left out so far.
+    Attributes:
+        size: width and height that most pictures have; others are skipped.
+    Raises:
+        InputError: none of the pictures can be decoded, or the selection leaves none.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        entries: Sequence[Entry],
+        selection: Selection,
+        problems: list[str],
+        skipped: int,
+    ) -> None:
+        self.name = name
+        self.camera: Camera | None = None
+        self.truth: Trajectory | None = None
+        self.problems = problems
+        self.skipped = skipped
+        self._limit = selection.max_frames
+        self._entries = [
+            entry
+            for entry in entries
+            if entry[0] >= selection.skip
+            and (entry[0] - selection.skip) % selection.stride == 0
+        ]
+        if not self._entries:
+            raise InputError(
+                f"{name}: of {len(entries)} pictures, input.skip={selection.skip} and "
+                f"input.stride={selection.stride} leave none",
+                "make input.skip smaller than the number of pictures",
+            )
+        count = len(self._entries)
+        self.length: int | None = min(count, self._limit) if self._limit else count
+        self.size = self._most_common_size()
+        self._first_pass = True
+
+    def _most_common_size(self) -> tuple[int, int]:
+        """Size of most of a few pictures spread over the whole; the earliest wins a tie."""
+        last = len(self._entries) - 1
+        probes = sorted({round(i * last / (_PROBES - 1)) for i in range(_PROBES)})
+        rest = [i for i in range(last + 1) if i not in probes]
+        sizes: Counter[tuple[int, int]] = Counter()
+        reason = ""
+        for tried, i in enumerate(probes + rest):
+            if tried >= len(probes) and sizes:
+                break
+            try:
+                height, width = read_image(self._entries[i][2]).shape[:2]
+            except InputError as error:
+                reason = error.message
+                continue
+            sizes[width, height] += 1
+        if not sizes:
+            raise InputError(
+                f"{self.name}: none of the {last + 1} pictures can be used; "
+                f"the last one tried: {reason}",
+                f"for instance {self._entries[0][2]}",
+            )
+        return sizes.most_common(1)[0][0]
+
+    def frames(self) -> Iterator[RawFrame]:
+        """A fresh pass; pictures are decoded ahead in a thread."""
+        return prefetch(self._decode())
+
+    def _decode(self) -> Generator[RawFrame, None, None]:
+        counts, self._first_pass = self._first_pass, False
+        notes = Notes(self.problems if counts else [])
+        done = 0
+        for index, time, path in self._entries:
+            if self._limit and done == self._limit:
+                break
+            try:
+                image = read_image(path)
+            except InputError as error:
+                notes.add(
+                    "pictures that cannot be read", f"{path.name}: {error.message}, skipped"
+                )
+                self.skipped += counts
+                continue
+            height, width = image.shape[:2]
+            if (width, height) != self.size:
+                notes.add(
+                    "pictures of another size",
+                    f"{path.name}: is {width}x{height} pixels where the others are "
+                    f"{self.size[0]}x{self.size[1]}, skipped",
+                )
+                self.skipped += counts
+                continue
+            done += 1
+            yield RawFrame(index, time, image, path.name)
+        notes.finish()
