@@ -1,0 +1,104 @@
+"""From confidence and uncertainty to the weights of bundle adjustment (REFERENCE 3.1).
+
+Bundle adjustment never sees an uncertainty: it gets `confidence x gate x validity`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch.nn import functional as F
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["GateKind", "gate", "residual_weights"]
+
+GateKind = Literal["rational", "inverse", "none"]
+
+
+def gate(
+    u: Tensor,
+    kind: GateKind = "rational",
+    slope: float = 45.0,
+    shift: float = 35.0,
+    floor: float = 0.1,
+) -> Tensor:
+    """Share in [0,1] of its weight that a cell of uncertainty `u` keeps; 1 where `u` is 0.
+
+    A `u` that is not finite gets 0: what cannot be judged is not trusted.
+
+    Args:
+        u: any shape, >= 0.
+        kind: "rational" is `1 / max(slope * u - shift, floor)` as in the published code (1 up to
+            u = (1 + shift) / slope = 0.8 with the defaults); "inverse" is `1 / u` as in the
+            paper; both clamped to [0,1]. "none" is 1 everywhere.
+        slope, shift, floor: of the rational gate; floor > 0.
+    Returns:
+        The same shape, dtype and device.
+    Raises:
+        ValueError: `kind` is none of the three, or `floor` is not positive.
+    """
+    if kind == "none":
+        return torch.ones_like(u)
+    if kind == "rational":
+        if floor <= 0:
+            raise ValueError(f"the floor of the rational gate must be positive, not {floor}")
+        weight = (slope * u - shift).clamp_min(floor).reciprocal().clamp(0.0, 1.0)
+    elif kind == "inverse":
+        # Clamping below at 1 is the clamp of the weight at 1, without a division by zero.
+        weight = u.clamp_min(1.0).reciprocal()
+    else:
+        raise ValueError(f"no gate is called {kind!r}; valid: rational, inverse, none")
+    return torch.where(torch.isfinite(u), weight, torch.zeros_like(weight))
+
+
+def residual_weights(
+    confidence: Tensor,
+    valid: Tensor | None,
+    gates: Tensor | None,
+    ii: Tensor,
+    jj: Tensor,
+    target: Tensor,
+    bidirectional: bool = False,
+    scale: float = 1.0,
+) -> Tensor:
+    """Weights of all residuals: `scale * confidence * gate of the source * validity`.
+
+    Args:
+        confidence: [E,h,w,2] >= 0.
+        valid: [E,h,w] bool, or None where every cell is valid.
+        gates: [N,h,w] in [0,1] from `gate`, or None to leave uncertainty out.
+        ii, jj: [E] int64 into `gates`.
+        target: [E,h,w,2] measured position in frame j, cells; only read when `bidirectional`.
+        bidirectional: multiply by the gate of frame j too, interpolated at `target` where that
+            lies inside the grid (off in the published system).
+        scale: factor on the confidence (0.001 for the published network's).
+    Returns:
+        [E,h,w,2], a fresh tensor; confidences that are not finite stay so, for bundle adjustment
+        counts and drops them.
+    """
+    weight = confidence * scale
+    if gates is not None:
+        factor = gates[ii]
+        if bidirectional:
+            factor = factor * _gate_at(gates[jj], target)
+        weight = weight * factor[..., None].to(weight.dtype)
+    if valid is not None:
+        weight = weight * valid[..., None].to(weight.dtype)
+    return weight
+
+
+def _gate_at(gates: Tensor, target: Tensor) -> Tensor:
+    """Gates [E,h,w] interpolated at targets [E,h,w,2]; 1 where these lie outside the grid."""
+    height, width = gates.shape[-2:]
+    x, y = target.unbind(-1)
+    # A comparison with NaN is false, so that a broken target counts as outside.
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    size = target.new_tensor([max(width - 1, 1), max(height - 1, 1)])
+    where = torch.where(inside[..., None], target / size * 2 - 1, torch.zeros_like(target))
+    found = F.grid_sample(
+        gates[:, None], where.to(gates.dtype), padding_mode="border", align_corners=True
+    )[:, 0]
+    return torch.where(inside, found, torch.ones_like(found))

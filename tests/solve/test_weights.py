@@ -1,0 +1,79 @@
+"""The gate's published table, and what reaches bundle adjustment as a weight."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from droidw.solve.weights import gate, residual_weights
+
+
+def test_rational_gate_matches_the_published_table() -> None:
+    # REFERENCE 3.1, given there to two or three digits
+    u = torch.tensor([0.0, 0.3, 0.8, 0.82, 0.85, 0.9, 1.0, 1.3, 1.77], dtype=torch.float64)
+    expected = torch.tensor([1, 1, 1, 0.53, 0.31, 0.18, 0.10, 0.043, 0.022], dtype=torch.float64)
+    assert torch.allclose(gate(u), expected, atol=6e-3)
+
+
+def test_gate_falls_and_stays_in_range() -> None:
+    u = torch.linspace(0, 20, 500)
+    for kind in ("rational", "inverse", "none"):
+        g = gate(u, kind)  # type: ignore[arg-type]
+        assert float(g.min()) >= 0.0 and float(g.max()) <= 1.0
+        assert bool((g[1:] <= g[:-1]).all())
+        assert float(g[0]) == 1.0
+
+
+def test_inverse_gate_is_one_over_u_above_one() -> None:
+    assert gate(torch.tensor([0.5, 1.0, 2.0, 4.0]), "inverse").tolist() == [1.0, 1.0, 0.5, 0.25]
+
+
+def test_gate_of_nonsense_is_zero_and_bad_arguments_are_refused() -> None:
+    nan = torch.tensor([float("nan"), float("inf"), 0.1])
+    assert gate(nan).tolist() == [0.0, 0.0, 1.0]
+    assert gate(nan, "inverse").tolist() == [0.0, 0.0, 1.0]
+    with pytest.raises(ValueError, match="rational, inverse, none"):
+        gate(nan, "linear")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="positive"):
+        gate(nan, floor=0.0)
+
+
+def _edges() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(3)
+    confidence = torch.rand(3, 4, 5, 2, generator=generator)
+    gates = torch.rand(3, 4, 5, generator=generator)
+    return confidence, gates, torch.tensor([0, 1, 2]), torch.tensor([1, 2, 0])
+
+
+def test_weights_multiply_scale_gate_of_the_source_and_validity() -> None:
+    confidence, gates, ii, jj = _edges()
+    valid = torch.zeros(3, 4, 5, dtype=torch.bool)
+    valid[:, 1:3] = True
+    target = torch.zeros(3, 4, 5, 2)
+    weight = residual_weights(confidence, valid, gates, ii, jj, target, scale=0.001)
+    assert torch.allclose(weight, 0.001 * confidence * (gates[ii] * valid)[..., None])
+    plain = residual_weights(confidence, None, None, ii, jj, target)
+    assert torch.equal(plain, confidence) and plain is not confidence
+
+
+def test_bidirectional_gate_is_sampled_at_the_target_and_one_outside() -> None:
+    confidence, gates, ii, jj = _edges()
+    target = torch.full((3, 4, 5, 2), 1.0)
+    target[..., 0] = 2.5  # between columns 2 and 3 of row 1
+    target[:, 0, 0] = torch.tensor([-0.1, 1.0])
+    target[:, 0, 1] = float("nan")
+    weight = residual_weights(confidence, None, gates, ii, jj, target, bidirectional=True)
+    between = 0.5 * (gates[jj, 1, 2] + gates[jj, 1, 3])
+    factor = gates[ii] * between[:, None, None]
+    factor[:, 0, :2] = gates[ii][:, 0, :2]
+    assert torch.allclose(weight, confidence * factor[..., None], atol=1e-6)
+
+
+def test_one_row_of_cells_can_be_sampled() -> None:
+    gates = torch.full((2, 1, 1), 0.5)
+    confidence = torch.ones(1, 1, 1, 2)
+    weight = residual_weights(
+        confidence, None, gates, torch.tensor([0]), torch.tensor([1]),
+        torch.zeros(1, 1, 1, 2), bidirectional=True,
+    )
+    assert weight.flatten().tolist() == [0.25, 0.25]
