@@ -72,9 +72,13 @@ class MotionFilterConfig:
     threshold: float = opt(0.9, "mean flow from the last keyframe, in grid cells", gt=0)
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
-        0.5, "a frame in which less than this share of the cells is matched is taken at once",
+        0.3, "a frame in which less than this share of the cells is matched is taken at once",
         ge=0, le=1,
     )
+    lost_below: float = opt(
+        0.03, "matched share below which a frame counts as blank or unrelated", ge=0, le=1
+    )
+    patience: int = opt(10, "unrelated frames in a row after which one is taken all the same", ge=1)
 
 
 @dataclass
@@ -113,6 +117,9 @@ class FrontendConfig:
     nms: int = opt(1, "suppression radius around existing edges", ge=0)
     max_factors: int = opt(75, "active edges at most", ge=4)
     max_age: int = opt(50, "updates after which an edge is retired", ge=1)
+    predict: Literal["velocity", "hold"] = opt(
+        "velocity", "velocity: go on with the last motion and depth; hold: last pose, mean depth"
+    )
 
 
 @dataclass
@@ -133,6 +140,9 @@ class FillerConfig:
 
     updates: int = opt(3, "motion-only update steps per batch", ge=0)
     batch: int = opt(16, "frames per batch", ge=1)
+    cache_mb: int = opt(
+        512, "memory for what correspondence keeps of frames; beyond it they are read again", ge=0
+    )
 
 
 @dataclass
@@ -150,6 +160,8 @@ class WeightingConfig:
     damping_scale: float = opt(0.2, "factor on the learned depth damping", ge=0)
     damping_floor: float = opt(1e-7, "added to the depth damping", ge=0)
     prior_weight: float = opt(0.001, "gamma_d, weight of the depth prior", ge=0)
+    min_disp: float = opt(1e-3, "smallest disparity", gt=0)
+    max_disp: float = opt(0.0, "largest disparity (0: unbounded)", ge=0)
 
 
 @dataclass
@@ -194,14 +206,17 @@ class DroidwConfig:
         default_factory=lambda: {
             "init_blind": PhaseConfig(updates=8, weigh=False),
             "init": PhaseConfig(updates=8),
+            "init_again": PhaseConfig(updates=0),
             "window": PhaseConfig(updates=2),
             "window_kept": PhaseConfig(updates=2),
             "global": PhaseConfig(updates=0, learn=False, depth_prior=False),
+            "fill": PhaseConfig(updates=0, learn=False, depth_prior=False),
         },
-        metadata={"help": "phases: init_blind, init, window, window_kept, global"},
+        metadata={"help": "phases: init_blind, init, init_again, window, window_kept, global, fill"},
     )
     solver: SolverConfig = field(default_factory=SolverConfig)
     global_solver: SolverConfig = field(default_factory=lambda: SolverConfig(lm=1e-5, ep=1e-2))
+    filler_solver: SolverConfig = field(default_factory=SolverConfig)
 
     device: str = opt("auto", "auto, cpu, cuda, cuda:N")
     seed: int = opt(0, "seed of everything that draws numbers", ge=0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from droidw.geometry.camera import Grid
     from droidw.slam.frame import Frame
 
-__all__ = ["Correspondence", "EdgeRequest", "EdgeSession", "EdgeUpdate", "Motion"]
+__all__ = ["Correspondence", "EdgeRequest", "EdgeSession", "EdgeUpdate", "Motion", "Purpose"]
+
+Purpose = Literal["window", "global", "fill"]
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,8 @@ class Motion:
     """How far the picture moved between two frames.
 
     Attributes:
-        flow: mean length of the flow in grid cells, over what could be matched.
+        flow: length of the flow in grid cells that the bulk of the matched cells has; close to
+            zero for a camera at rest even while something moves in front of it.
         matched: share of cells in [0,1] that could be matched.
     """
 
@@ -109,9 +112,19 @@ class Correspondence(Protocol):
         ...
 
     def motion(self, reference: Any, current: Any) -> Motion:
-        """How far the picture moved from `reference` to `current` (payloads)."""
+        """How far the picture moved from `reference` to `current` (payloads).
+
+        Called from worker threads, several at once, where the component has the capability
+        "threads".
+        """
         ...
 
-    def session(self, *, low_memory: bool = False) -> EdgeSession:
-        """Fresh edge state; `low_memory` for graphs with very many edges."""
+    def session(self, purpose: Purpose = "window") -> EdgeSession:
+        """Fresh edge state for one graph.
+
+        Args:
+            purpose: "window" for the sliding window; "global" for very many edges, where
+                memory counts; "fill" for motion-only edges from keyframes to other frames,
+                each asked for in one direction.
+        """
         ...

@@ -1,0 +1,150 @@
+"""The keyframe store: every per-keyframe quantity, declared once and moved together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from droidw.geometry.camera import Grid
+from droidw.interfaces.uncertainty import StoreField
+
+__all__ = ["KeyframeInfo", "KeyframeStore"]
+
+_FIRST_CAPACITY = 16
+
+
+@dataclass
+class KeyframeInfo:
+    """What a keyframe has besides tensors.
+
+    Attributes:
+        index, time, name: of its frame.
+        image: [H,W,3] uint8 RGB at working size.
+        payload: what the correspondence op keeps; opaque.
+    """
+
+    index: int
+    time: float
+    name: str
+    image: npt.NDArray[np.uint8]
+    payload: Any
+
+
+class KeyframeStore:
+    """Grows as needed; `remove` moves every declared field by construction.
+
+    Core fields, each [N,...] and returned as views into the storage:
+        T_cw [7] world to camera; disps [h,w] inverse depth; prior [h,w] inverse depth of the
+        depth prior (0: none); features [c,h,w]; uncertainty [h,w]; damping [h,w] learned.
+
+    Args:
+        grid: the grid on which maps live.
+        intrinsics: [4] fx, fy, cx, cy of the working image, in pixels.
+        feature_dim: channels of the feature extractor (0: none).
+        fields: further per-keyframe tensors that parts asked for.
+        device: where tensors live.
+        feature_dtype: precision in which features are held.
+    """
+
+    def __init__(
+        self,
+        grid: Grid,
+        intrinsics: Tensor,
+        feature_dim: int = 0,
+        fields: Sequence[StoreField] = (),
+        device: torch.device | str = "cpu",
+        feature_dtype: torch.dtype = torch.float32,
+    ) -> None:
+        self.grid = grid
+        self.device = torch.device(device)
+        self.image_intrinsics = intrinsics.to(self.device)
+        self.intrinsics = grid.intrinsics(self.image_intrinsics)
+        self.infos: list[KeyframeInfo] = []
+        core = (
+            StoreField("T_cw", (7,)),
+            StoreField("disps", ("h", "w"), fill=1.0),
+            StoreField("prior", ("h", "w")),
+            StoreField("features", ("c", "h", "w"), dtype=str(feature_dtype).split(".")[-1]),
+            StoreField("uncertainty", ("h", "w")),
+            StoreField("damping", ("h", "w"), fill=1e-6),
+        )
+        self._declared = {}
+        sizes = {"h": grid.height, "w": grid.width, "c": feature_dim}
+        for declared in (*core, *fields):
+            if declared.name in self._declared:
+                raise ValueError(f"the store field '{declared.name}' is declared twice")
+            self._declared[declared.name] = declared
+        self._data: dict[str, Tensor] = {}
+        for name, declared in self._declared.items():
+            shape = tuple(sizes[s] if isinstance(s, str) else s for s in declared.shape)
+            self._data[name] = self._filled(declared, (_FIRST_CAPACITY, *shape))
+        self._own = tuple(declared.name for declared in fields)
+
+    def _filled(self, declared: StoreField, shape: tuple[int, ...]) -> Tensor:
+        dtype = getattr(torch, declared.dtype)
+        return torch.full(shape, declared.fill, dtype=dtype, device=self.device)
+
+    def __len__(self) -> int:
+        return len(self.infos)
+
+    def __getitem__(self, name: str) -> Tensor:
+        """Field `name` of all keyframes, [N,...], a view."""
+        return self._data[name][: len(self.infos)]
+
+    @property
+    def T_cw(self) -> Tensor:  # noqa: N802 - frame names are part of the variable
+        """[N,7] world to camera."""
+        return self["T_cw"]
+
+    @property
+    def disps(self) -> Tensor:
+        """[N,h,w] inverse depth."""
+        return self["disps"]
+
+    def extra(self) -> dict[str, Tensor]:
+        """Views of the fields that parts asked for."""
+        return {name: self[name] for name in self._own}
+
+    def append(self, info: KeyframeInfo, **values: Tensor) -> int:
+        """Add a keyframe and return its number; fields not given hold their fill value."""
+        n = len(self.infos)
+        for name, declared in self._declared.items():
+            data = self._data[name]
+            if n == data.shape[0]:
+                grown = self._filled(declared, (2 * n, *data.shape[1:]))
+                grown[:n] = data
+                self._data[name] = data = grown
+            if name in values:
+                data[n] = values[name]
+            else:
+                data[n].fill_(declared.fill)
+        self.infos.append(info)
+        return n
+
+    def remove(self, index: int) -> None:
+        """Delete keyframe `index`; later ones move up by one, with all their fields."""
+        n = len(self.infos)
+        if not 0 <= index < n:
+            raise IndexError(f"keyframe {index} of {n}")
+        for data in self._data.values():
+            data[index : n - 1] = data[index + 1 : n].clone()
+        del self.infos[index]
+
+    def write(self, T_cw: Tensor, disps: Tensor) -> None:  # noqa: N803
+        """Replace poses and disparities of all keyframes."""
+        self.T_cw.copy_(T_cw)
+        self.disps.copy_(disps)
+
+    def payload(self, index: int) -> Any:
+        """The correspondence payload of keyframe `index`."""
+        return self.infos[index].payload
+
+    def times(self) -> list[float]:
+        """Times of all keyframes in seconds."""
+        return [info.time for info in self.infos]

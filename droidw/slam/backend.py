@@ -1,0 +1,79 @@
+"""Global bundle adjustment over all keyframes (REFERENCE 5.7)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from droidw.geometry.projective import frame_distance
+from droidw.graph.factors import FactorGraph
+from droidw.graph.proximity import backend_edges
+
+if TYPE_CHECKING:
+    from droidw.config.schema import DroidwConfig
+    from droidw.slam.optimise import Optimiser
+
+__all__ = ["Backend"]
+
+# Pairs whose distance is computed at once; bounds memory, not the result.
+_CHUNK = 2048
+
+
+class Backend:
+    """Rebuilds a graph over the whole sequence and optimises it."""
+
+    def __init__(self, optimiser: Optimiser, config: DroidwConfig) -> None:
+        self.optimiser = optimiser
+        self.config = config
+
+    def run(self, tell: Callable[[int, int], None]) -> int:
+        """All passes of the configuration.
+
+        Args:
+            tell: called with (update steps done, update steps in all).
+        Returns:
+            The number of edges of the last pass, 0 if there was nothing to do.
+        """
+        options, store = self.config.backend, self.optimiser.store
+        if len(store) < 3:
+            return 0
+        phase = self.config.schedule["global"]
+        total = sum(options.passes)
+        done = edges = 0
+        for updates in options.passes:
+            graph = FactorGraph(store.grid.height, store.grid.width, store.device)
+            graph.add(self._edges())
+            if len(graph) < 3:
+                return 0
+            session = self.optimiser.parts.correspondence.session("global")
+            for _ in range(updates):
+                self.optimiser.update(
+                    graph, session, phase, self.config.global_solver, first_free=1
+                )
+                done += 1
+                tell(done, total)
+            edges = len(graph)
+        return edges
+
+    def _edges(self) -> list[tuple[int, int]]:
+        store, options = self.optimiser.store, self.config.backend
+        count = len(store)
+        ii, jj = torch.tril_indices(count, count, -1)
+        near = []
+        for start in range(0, len(ii), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            near.append(
+                frame_distance(
+                    store.T_cw, store.disps, store.intrinsics,
+                    ii[part].to(store.device), jj[part].to(store.device), options.beta,
+                ).cpu()
+            )
+        distance = np.full((count, count), np.inf)
+        distance[ii.numpy(), jj.numpy()] = torch.cat(near).double().numpy()
+        return backend_edges(
+            distance, radius=options.radius, nms=options.nms, threshold=options.threshold,
+            max_factors=options.factors_per_keyframe * count,
+        )

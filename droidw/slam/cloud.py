@@ -1,0 +1,101 @@
+"""Which depths several keyframes agree on, and the static point cloud made of them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from droidw.geometry import se3
+from droidw.geometry.projective import relative_pose, reproject
+from droidw.slam.frame import CloudPoints
+
+if TYPE_CHECKING:
+    from droidw.config.schema import CloudConfig
+    from droidw.graph.store import KeyframeStore
+
+__all__ = ["consistent_depth", "static_cloud"]
+
+# Neighbours on either side that a depth is compared with (REFERENCE 5.9, with the slip mended).
+_REACH = 3
+
+
+def consistent_depth(store: KeyframeStore, relative_threshold: float, min_views: int) -> Tensor:
+    """Cells whose depth at least `min_views` neighbouring keyframes confirm, [N,h,w] bool.
+
+    A neighbour confirms a cell if the depth that the cell would have there and the depth that
+    the neighbour has at one of the four cells around it differ by less than
+    `relative_threshold`, as a share of the depth.
+    """
+    count = len(store)
+    height, width = store.grid.height, store.grid.width
+    views = torch.zeros(count, height, width, dtype=torch.int64, device=store.device)
+    for gap in range(-_REACH, _REACH + 1):
+        first, last = max(0, -gap), min(count, count - gap)
+        if gap == 0 or last <= first:
+            continue
+        ii = torch.arange(first, last, device=store.device)
+        jj = ii + gap
+        coords, valid = reproject(store.T_cw, store.disps, store.intrinsics, ii, jj)
+        G = relative_pose(store.T_cw, ii, jj)  # noqa: N806
+        there = _depth_there(store, G, ii)
+        x0, y0 = coords[..., 0].floor().long(), coords[..., 1].floor().long()
+        agrees = torch.zeros_like(valid)
+        for dx in (0, 1):
+            for dy in (0, 1):
+                x, y = x0 + dx, y0 + dy
+                inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+                flat = (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).flatten(1)
+                seen = store.disps[jj].flatten(1).gather(1, flat).view_as(there)
+                agrees |= inside & ((there * seen - 1.0).abs() < relative_threshold)
+        views[first:last] += (agrees & valid).long()
+    return views >= min_views
+
+
+def _depth_there(store: KeyframeStore, G: Tensor, ii: Tensor) -> Tensor:  # noqa: N803
+    """Depth [E,h,w] that the cells of frames ii have in the other camera."""
+    rays = _rays(store)
+    R, t = se3.rotation(G), G[:, :3]  # noqa: N806
+    disps = store.disps[ii]
+    z = torch.einsum("ec,hwc->ehw", R[:, 2], rays) / disps + t[:, 2, None, None]
+    return z
+
+
+def _rays(store: KeyframeStore) -> Tensor:
+    """Viewing rays [h,w,3] of the grid with unit depth."""
+    fx, fy, cx, cy = store.intrinsics.unbind()
+    x = (torch.arange(store.grid.width, device=store.device) - cx) / fx
+    y = (torch.arange(store.grid.height, device=store.device) - cy) / fy
+    gy, gx = torch.meshgrid(y, x, indexing="ij")
+    return torch.stack([gx, gy, torch.ones_like(gx)], -1)
+
+
+def static_cloud(
+    store: KeyframeStore, valid: Tensor, weight: Tensor, options: CloudConfig
+) -> CloudPoints:
+    """Points of all confirmed, static, not too far cells in the world frame, coloured.
+
+    Args:
+        store: keyframes. valid: [N,h,w] of `consistent_depth`.
+        weight: [N,h,w] in [0,1], what uncertainty left of the weight.
+        options: thresholds.
+    """
+    if len(store) == 0:
+        return CloudPoints(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    depth = 1.0 / store.disps
+    keep = valid & (weight >= options.min_weight)
+    if options.far > 0 and bool(keep.any()):
+        keep &= depth < options.far * depth[keep].median()
+    rays = _rays(store)
+    T_wc = se3.inv(store.T_cw)  # noqa: N806
+    points = se3.act(T_wc, (rays[None] * depth[..., None]).flatten(1, 2))
+    chosen = keep.flatten().nonzero()[:, 0]
+    if len(chosen) > options.max_points:
+        step = len(chosen) / options.max_points
+        chosen = chosen[(torch.arange(options.max_points) * step).long()]
+    xyz = points.reshape(-1, 3)[chosen].float().cpu().numpy()
+    centres = store.grid.centres().round().long().numpy()
+    rgb = np.stack([info.image[centres[..., 1], centres[..., 0]] for info in store.infos])
+    return CloudPoints(xyz, rgb.reshape(-1, 3)[chosen.cpu().numpy()])

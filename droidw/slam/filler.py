@@ -1,0 +1,129 @@
+"""Poses of all frames between the keyframes (REFERENCE 5.8)."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from droidw.geometry.interpolate import interpolate
+from droidw.geometry.projective import reproject
+from droidw.geometry.se3 import exp, inv, log, mul
+from droidw.interfaces.correspondence import EdgeRequest
+from droidw.solve.problem import BAProblem
+from droidw.solve.weights import residual_weights
+
+if TYPE_CHECKING:
+    from droidw.config.schema import DroidwConfig
+    from droidw.slam.motion_filter import Encoded
+    from droidw.slam.optimise import Optimiser
+
+__all__ = ["Filler"]
+
+
+class Filler:
+    """Interpolates a frame between its two keyframes, then refines it, motion only."""
+
+    def __init__(self, optimiser: Optimiser, config: DroidwConfig) -> None:
+        self.optimiser = optimiser
+        self.config = config
+        store = optimiser.store
+        self._times = store.times()
+        self._rows = {info.index: row for row, info in enumerate(store.infos)}
+        self._gates = optimiser.gates()
+
+    def is_keyframe(self, index: int) -> bool:
+        """Whether frame `index` is a keyframe and needs no filling."""
+        return index in self._rows
+
+    def keyframe_pose(self, index: int) -> Tensor:
+        """Pose [7] of the keyframe made from frame `index`."""
+        return self.optimiser.store.T_cw[self._rows[index]]
+
+    def neighbours(self, time: float) -> tuple[int, int]:
+        """The keyframes before and after `time`; equal at either end."""
+        after = bisect_right(self._times, time)
+        before = max(after - 1, 0)
+        return before, min(after, len(self._times) - 1)
+
+    def start(self, time: float) -> Tensor:
+        """Interpolated pose [7] at `time`; held motion beyond the last keyframe."""
+        T_cw = self.optimiser.store.T_cw  # noqa: N806
+        before, after = self.neighbours(time)
+        if before != after:
+            share = (time - self._times[before]) / (self._times[after] - self._times[before])
+            return interpolate(T_cw[before], T_cw[after], share)
+        if before == 0 or time <= self._times[before]:
+            return T_cw[before]
+        span = self._times[before] - self._times[before - 1]
+        ahead = min((time - self._times[before]) / span, 1.0)
+        velocity = log(mul(T_cw[before], inv(T_cw[before - 1])))
+        return mul(exp(velocity * ahead), T_cw[before])
+
+    def fill(self, frames: Iterable[Encoded]) -> list[Tensor]:
+        """Poses [7] of a batch of frames that are not keyframes."""
+        batch = list(frames)
+        start = torch.stack([self.start(e.frame.time) for e in batch])
+        updates = self.config.filler.updates
+        if updates == 0 or len(self._times) < 2:
+            return list(start.unbind(0))
+        return list(self._refine(batch, start, updates).unbind(0))
+
+    def _refine(self, batch: list[Encoded], start: Tensor, updates: int) -> Tensor:
+        store, optimiser = self.optimiser.store, self.optimiser
+        wanted = [sorted(set(self._sources(e.frame.time))) for e in batch]
+        used = sorted({k for ks in wanted for k in ks})
+        local = {k: n for n, k in enumerate(used)}
+        nodes = [store.payload(k) for k in used] + [e.payload for e in batch]
+        pairs = [(local[k], len(used) + f) for f, ks in enumerate(wanted) for k in ks]
+        device = store.device
+        ii = torch.tensor([i for i, _ in pairs], dtype=torch.int64, device=device)
+        jj = torch.tensor([j for _, j in pairs], dtype=torch.int64, device=device)
+        at = torch.tensor(used, dtype=torch.int64, device=device)
+        T_cw = torch.cat([store.T_cw[at], start])  # noqa: N806
+        blank = store.disps.new_ones(len(batch), *store.disps.shape[1:])
+        disps = torch.cat([store.disps[at], blank])
+        gates = torch.cat([self._gates[at], blank])
+        fixed = torch.arange(len(T_cw), device=device) < len(used)
+        session = optimiser.parts.correspondence.session("fill")
+        phase, solver = self.config.schedule["fill"], self.config.filler_solver
+        for _ in range(updates):
+            with optimiser.clock("fill: reproject"):
+                coords, valid = reproject(T_cw, disps, store.intrinsics, ii, jj)
+            with optimiser.clock("fill: correspondence"):
+                answer = session.update(
+                    EdgeRequest(
+                        ids=list(range(len(pairs))),
+                        ii=[i for i, _ in pairs],
+                        jj=[j for _, j in pairs],
+                        coords=coords,
+                        valid=valid,
+                        payload=nodes.__getitem__,
+                    )
+                )
+            weighting = self.config.weighting
+            weight = residual_weights(
+                answer.confidence, None, gates if phase.weigh else None, ii, jj, answer.target,
+                bidirectional=False, scale=weighting.confidence_scale,
+            )
+            with optimiser.clock("fill: bundle"):
+                for _ in range(phase.iterations):
+                    step = optimiser.parts.ba.step(
+                        BAProblem(
+                            T_cw=T_cw, disps=disps, intrinsics=store.intrinsics, ii=ii, jj=jj,
+                            target=answer.target, weight=weight, fixed=fixed,
+                            damping=torch.zeros_like(disps), motion_only=True,
+                            lm=solver.lm, ep=solver.ep, huber=solver.huber or None,
+                        )
+                    )
+                    T_cw = step.T_cw  # noqa: N806
+        return T_cw[len(used) :]
+
+    def _sources(self, time: float) -> list[int]:
+        before, after = self.neighbours(time)
+        if before == after and before > 0:
+            return [before - 1, before]
+        return [before, after]

@@ -1,0 +1,233 @@
+"""One update step: correspondence, then bundle adjustment and uncertainty in turns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from droidw.geometry.projective import reproject
+from droidw.interfaces.correspondence import EdgeRequest
+from droidw.interfaces.uncertainty import UncertaintyView
+from droidw.solve.problem import BAProblem, Report
+from droidw.solve.weights import gate, residual_weights
+
+if TYPE_CHECKING:
+    from droidw.config.schema import PhaseConfig, SolverConfig, WeightingConfig
+    from droidw.graph.factors import FactorGraph
+    from droidw.graph.store import KeyframeStore
+    from droidw.interfaces.bundle import BundleAdjuster
+    from droidw.interfaces.correspondence import Correspondence, EdgeSession
+    from droidw.interfaces.depth import DepthPrior
+    from droidw.interfaces.features import FeatureExtractor
+    from droidw.interfaces.uncertainty import UncertaintyModel
+    from droidw.slam.timing import Stopwatch
+
+__all__ = ["Optimiser", "Parts"]
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The plugins of a run, built."""
+
+    features: FeatureExtractor
+    depth: DepthPrior
+    uncertainty: UncertaintyModel
+    ba: BundleAdjuster
+    correspondence: Correspondence
+
+
+class Optimiser:
+    """Alternates the parts over a factor graph as a phase of the schedule says.
+
+    Args:
+        store: keyframes; poses, disparities and uncertainty are written back to it.
+        parts: the plugins.
+        weighting: how confidence and uncertainty become weights.
+        clock: where the time of each part is added up.
+    """
+
+    def __init__(
+        self, store: KeyframeStore, parts: Parts, weighting: WeightingConfig, clock: Stopwatch
+    ) -> None:
+        self.store = store
+        self.parts = parts
+        self.weighting = weighting
+        self.clock = clock
+        self.iterations = 0
+        self.reports: dict[str, int] = {}
+
+    def measure(
+        self, graph: FactorGraph, session: EdgeSession, rows: list[int], informed: bool
+    ) -> None:
+        """Ask correspondence about these edges and keep its answer in the graph."""
+        if not rows:
+            return
+        store = self.store
+        ii, jj = graph.index(rows)
+        with self.clock("reproject"):
+            coords, valid = reproject(store.T_cw, store.disps, store.intrinsics, ii, jj)
+        request = EdgeRequest(
+            ids=[graph.ids[r] for r in rows],
+            ii=[graph.ii[r] for r in rows],
+            jj=[graph.jj[r] for r in rows],
+            coords=coords,
+            valid=valid,
+            payload=store.payload,
+            informed=informed,
+        )
+        with self.clock("correspondence"):
+            answer = session.update(request)
+        at = torch.tensor(rows, dtype=torch.int64, device=graph.target.device)
+        graph.target[at] = answer.target
+        graph.confidence[at] = answer.confidence
+        if answer.damping is not None and answer.sources is not None:
+            store["damping"][answer.sources] = answer.damping
+
+    def update(
+        self,
+        graph: FactorGraph,
+        session: EdgeSession,
+        phase: PhaseConfig,
+        solver: SolverConfig,
+        *,
+        first_free: int,
+        reach: int = 3,
+        informed: bool = True,
+    ) -> None:
+        """One update step over the active edges, with retired ones near the window in BA.
+
+        Args:
+            graph, session: edges and their correspondence state.
+            phase: which parts take turns. solver: damping.
+            first_free: poses before this keyframe are held.
+            reach: retired edges take part if both ends are at `first_free - reach` or later.
+            informed: whether correspondence may search around what geometry predicts.
+        """
+        active = graph.select()
+        self.measure(graph, session, active, informed)
+        low = max(0, first_free - reach)
+        retired = [
+            r for r in graph.select(active=False) if min(graph.ii[r], graph.jj[r]) >= low
+        ]
+        self.adjust(graph, sorted(active + retired), phase, solver, first_free)
+        graph.grow_older(active)
+
+    def adjust(
+        self,
+        graph: FactorGraph,
+        rows: list[int],
+        phase: PhaseConfig,
+        solver: SolverConfig,
+        first_free: int,
+    ) -> None:
+        """Gauss-Newton iterations on these edges, each followed by an uncertainty update."""
+        if not rows:
+            return
+        ii, jj = graph.index(rows)
+        at = torch.tensor(rows, dtype=torch.int64, device=graph.target.device)
+        everything = len(rows) == len(graph)
+        target = graph.target if everything else graph.target[at]
+        confidence = graph.confidence if everything else graph.confidence[at]
+        for _ in range(phase.iterations):
+            with self.clock("bundle"):
+                self._step(ii, jj, target, confidence, phase, solver, first_free)
+            if phase.learn:
+                with self.clock("uncertainty"):
+                    self._learn(ii, jj, target, confidence, first_free)
+
+    def _step(
+        self,
+        ii: Tensor,
+        jj: Tensor,
+        target: Tensor,
+        confidence: Tensor,
+        phase: PhaseConfig,
+        solver: SolverConfig,
+        first_free: int,
+    ) -> None:
+        """One Gauss-Newton step on the part of the store that the edges touch."""
+        store, weighting = self.store, self.weighting
+        low = int(torch.minimum(ii.min(), jj.min()))
+        gates = self.gates(low) if phase.weigh else None
+        weight = residual_weights(
+            confidence, None, gates, ii - low, jj - low, target,
+            bidirectional=weighting.bidirectional, scale=weighting.confidence_scale,
+        )
+        count = len(store) - low
+        fixed = torch.arange(count, device=store.device) < first_free - low
+        problem = BAProblem(
+            T_cw=store.T_cw[low:],
+            disps=store.disps[low:],
+            intrinsics=store.intrinsics,
+            ii=ii - low,
+            jj=jj - low,
+            target=target,
+            weight=weight,
+            fixed=fixed,
+            damping=weighting.damping_scale * store["damping"][low:] + weighting.damping_floor,
+            prior=store["prior"][low:] if phase.depth_prior else None,
+            prior_weight=weighting.prior_weight,
+            lm=solver.lm,
+            ep=solver.ep,
+            huber=solver.huber or None,
+            guard=solver.guard,
+            min_disp=weighting.min_disp,
+            max_disp=weighting.max_disp or None,
+        )
+        step = self.parts.ba.step(problem)
+        self._note(step.report)
+        store.T_cw[low:] = step.T_cw
+        store.disps[low:] = step.disps
+
+    def _note(self, report: Report) -> None:
+        if report.status != "ok":
+            self.reports[report.status] = self.reports.get(report.status, 0) + 1
+        if report.dropped:
+            self.reports["dropped"] = self.reports.get("dropped", 0) + report.dropped
+
+    def gates(self, first: int = 0) -> Tensor:
+        """Weights in [0,1] of all cells of the keyframes from `first` on, [N-first,h,w]."""
+        w = self.weighting
+        u = self.store["uncertainty"][first:]
+        return gate(u, kind=w.gate, slope=w.slope, shift=w.shift, floor=w.floor)
+
+    def view(
+        self,
+        ii: Tensor | None = None,
+        jj: Tensor | None = None,
+        target: Tensor | None = None,
+        confidence: Tensor | None = None,
+        frames: Sequence[int] = (),
+    ) -> UncertaintyView:
+        """What the uncertainty model sees of the store and of these edges."""
+        store = self.store
+        none = torch.zeros(0, dtype=torch.int64, device=store.device)
+        blank = store.disps.new_zeros(0, store.grid.height, store.grid.width, 2)
+        return UncertaintyView(
+            features=store["features"],
+            uncertainty=store["uncertainty"],
+            fields=store.extra(),
+            T_cw=store.T_cw,
+            disps=store.disps,
+            intrinsics=store.intrinsics,
+            ii=none if ii is None else ii,
+            jj=none if jj is None else jj,
+            target=blank if target is None else target,
+            confidence=blank if confidence is None else confidence,
+            frames=torch.tensor(list(frames), dtype=torch.int64, device=store.device),
+            iteration=self.iterations,
+        )
+
+    def _learn(
+        self, ii: Tensor, jj: Tensor, target: Tensor, confidence: Tensor, first_free: int
+    ) -> None:
+        frames = sorted(set(ii.tolist()) | set(range(first_free, len(self.store))))
+        report = self.parts.uncertainty.update(self.view(ii, jj, target, confidence, frames))
+        self.iterations += 1
+        if not math.isfinite(report.energy):
+            self.reports["uncertainty"] = self.reports.get("uncertainty", 0) + 1

@@ -1,0 +1,296 @@
+"""The orchestrator: frames in, trajectory and keyframes out, one process (DESIGN, way of a frame)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from droidw.errors import InputError
+from droidw.events import Dispatcher, FrameTracked, KeyframeAdded, KeyframeRemoved, Progress
+from droidw.geometry.camera import Grid
+from droidw.geometry.se3 import inv
+from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.slam.backend import Backend
+from droidw.slam.cloud import consistent_depth, static_cloud
+from droidw.slam.diagnosis import Diagnosis, diagnose, parallax
+from droidw.slam.filler import Filler
+from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
+from droidw.slam.frontend import Frontend
+from droidw.slam.motion_filter import Encoded, MotionFilter, look_ahead
+from droidw.slam.optimise import Optimiser, Parts
+from droidw.slam.timing import Stopwatch
+
+if TYPE_CHECKING:
+    from droidw.config.schema import DroidwConfig
+    from droidw.geometry.camera import Camera
+
+__all__ = ["Outcome", "SlamSystem"]
+
+# Frames whose motion is measured ahead of the one being judged.
+_LOOK_AHEAD = 6
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What tracking came to: poses of all frames, the keyframes, the cloud and what to say."""
+
+    trajectory: Trajectory
+    keyframes: tuple[KeyframeRecord, ...]
+    cloud: CloudPoints
+    diagnosis: Diagnosis
+
+
+class SlamSystem:
+    """Composes the parts into motion filter, frontend, backend and filler.
+
+    `track` all frames, or feed them one by one with `push`; then `finish`.
+
+    Args:
+        config: resolved configuration.
+        parts: the plugins, built.
+        camera: the working camera (after rectification).
+        device: where tensors live.
+        events: who hears what happens.
+        threaded: whether correspondence may be called from threads ahead of time.
+    """
+
+    def __init__(
+        self,
+        config: DroidwConfig,
+        parts: Parts,
+        camera: Camera,
+        device: torch.device,
+        events: Dispatcher | None = None,
+        *,
+        threaded: bool = False,
+    ) -> None:
+        self.config = config
+        self.parts = parts
+        self.camera = camera
+        self.events = events or Dispatcher()
+        wait = torch.cuda.synchronize if device.type == "cuda" else None
+        self.clock = Stopwatch(wait)
+        op = parts.correspondence
+        self.grid = Grid.of(camera.height, camera.width, op.stride, op.offset)
+        if min(self.grid.height, self.grid.width) < 3:
+            raise InputError(
+                f"pictures of {camera.width}x{camera.height} px leave a grid of "
+                f"{self.grid.width}x{self.grid.height} cells, too few to track",
+                "at least 3 cells each way are needed; enlarge camera.long_side",
+            )
+        self.store = KeyframeStore(
+            self.grid, camera.intrinsics(), parts.features.dim, parts.uncertainty.fields, device
+        )
+        self.optimiser = Optimiser(self.store, parts, config.weighting, self.clock)
+        self.frontend = Frontend(self.optimiser, config)
+        workers = config.threads or os.cpu_count() or 1
+        self._pool = ThreadPoolExecutor(workers, "ahead") if threaded else None
+        self._filter = MotionFilter(op, config.motion_filter, self._pool)
+        self._times: list[float] = []
+        self._indices: list[int] = []
+        self._moved: list[float] = []
+        self._matched: list[float] = []
+        self._kept: dict[int, object] = {}
+        self._room = config.filler.cache_mb * 1e6
+
+    # -- tracking --------------------------------------------------------------------------
+
+    def track(self, frames: Iterable[Frame]) -> None:
+        """Push all frames, with motion measured ahead of the window where that is possible."""
+        encoded = (self._encode(frame) for frame in frames)
+        depth = _LOOK_AHEAD if self._pool is not None else 0
+        for item in look_ahead(encoded, depth, self._filter.expect):
+            self._push(item)
+
+    def push(self, frame: Frame) -> bool:
+        """Track one frame; returns whether it is a keyframe now."""
+        return self._push(self._encode(frame))
+
+    def _encode(self, frame: Frame) -> Encoded:
+        with self.clock("encode"):
+            return Encoded(frame, self.parts.correspondence.encode(frame, self.grid))
+
+    def _push(self, current: Encoded) -> bool:
+        frame = current.frame
+        with self.clock("motion filter"):
+            verdict = self._filter.judge(current)
+        self._times.append(frame.time)
+        self._indices.append(frame.index)
+        if verdict.motion is not None:
+            self._moved.append(verdict.motion.flow)
+            self._matched.append(verdict.motion.matched)
+        self._remember(current)
+        kept = False
+        if verdict.keep:
+            kept = self._keyframe(current, verdict.forced)
+        self.events.emit(
+            FrameTracked(frame.index, frame.time, len(self._times), len(self.store))
+        )
+        return kept
+
+    def _remember(self, current: Encoded) -> None:
+        """Hold the payload for the filler while there is room; beyond, frames are read again."""
+        size = _nbytes(current.payload)
+        if size <= self._room:
+            self._room -= size
+            self._kept[current.frame.index] = current.payload
+
+    def _keyframe(self, current: Encoded, forced: bool) -> bool:
+        number = self._append(current)
+        self.events.emit(KeyframeAdded(number, current.frame.index))
+        with self.clock("frontend"):
+            dropped = self.frontend.grow(forced)
+        if dropped:
+            self.events.emit(KeyframeRemoved(number, current.frame.index))
+        return not dropped
+
+    def _append(self, current: Encoded) -> int:
+        frame, parts, store = current.frame, self.parts, self.store
+        image = frame.image.to(store.device)
+        pose, disp = self.frontend.guess(frame.time)
+        with self.clock("features"):
+            features = parts.features.extract(image, self.grid)
+        with self.clock("depth prior"):
+            prior = self._prior(frame)
+        payload = parts.correspondence.context(current.payload, frame, self.grid)
+        pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
+        number = store.append(
+            KeyframeInfo(frame.index, frame.time, frame.name, pixels.cpu().numpy(), payload),
+            T_cw=pose, disps=disp, features=features, prior=prior,
+        )
+        with self.clock("uncertainty"):
+            parts.uncertainty.append(self.optimiser.view(), number)
+        return number
+
+    def _prior(self, frame: Frame) -> Tensor:
+        blank = self.store.disps.new_zeros(self.grid.height, self.grid.width)
+        prediction = self.parts.depth.predict(frame)
+        if prediction is None:
+            return blank
+        depth = self.grid.sample(prediction.depth.to(self.store.device), mode="nearest")
+        known = torch.isfinite(depth) & (depth > 0)
+        return torch.where(known, 1.0 / depth.clamp_min(1e-6), blank)
+
+    # -- finishing -------------------------------------------------------------------------
+
+    def finish(self, reread: Callable[[], Iterable[Frame]], *, brief: bool = False) -> Outcome:
+        """Global bundle adjustment, then a pose for every frame.
+
+        Args:
+            reread: a fresh pass over the same frames, for those that could not be held.
+            brief: after an interruption: no global passes, and only interpolated poses.
+        """
+        if not self.frontend.initialised and len(self.store) >= 2:
+            with self.clock("frontend"):
+                self.frontend.initialise()
+        found = diagnose(
+            self.store, self._moved, self._matched, self.config.motion_filter.lost_below
+        )
+        if found.still:
+            self._hold_still()
+        elif not brief:
+            with self.clock("global"):
+                Backend(self.optimiser, self.config).run(
+                    lambda done, total: self.events.emit(Progress("global", done, total))
+                )
+        with self.clock("fill"):
+            trajectory = self._trajectory(reread, quick=brief or found.still)
+        with self.clock("cloud"):
+            records, cloud = self._records()
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+        if not found.still:
+            found = replace(found, parallax=parallax(self.store))
+        return Outcome(trajectory, records, cloud, found)
+
+    def _hold_still(self) -> None:
+        """A camera at rest: every pose is the first, and no depth can be known."""
+        first = self.store.T_cw[0].clone()
+        self.store.T_cw.copy_(first.expand_as(self.store.T_cw))
+
+    def _trajectory(self, reread: Callable[[], Iterable[Frame]], quick: bool) -> Trajectory:
+        filler = Filler(self.optimiser, self.config)
+        poses: dict[int, Tensor] = {}
+        pending: list[Encoded] = []
+        done = 0
+
+        def flush() -> None:
+            nonlocal done
+            for encoded, pose in zip(pending, filler.fill(pending), strict=True):
+                poses[encoded.frame.index] = pose
+            done += len(pending)
+            pending.clear()
+            self.events.emit(Progress("fill", done, len(self._times)))
+
+        if not quick:
+            for encoded in self._unfilled(filler, reread):
+                pending.append(encoded)
+                if len(pending) == self.config.filler.batch:
+                    flush()
+            if pending:
+                flush()
+        for index, time in zip(self._indices, self._times, strict=True):
+            if filler.is_keyframe(index):
+                poses[index] = filler.keyframe_pose(index)
+            elif index not in poses:
+                poses[index] = filler.start(time)
+        T_cw = torch.stack([poses[i] for i in self._indices]).double()  # noqa: N806
+        return Trajectory(
+            times=np.asarray(self._times, dtype=np.float64),
+            T_wc=inv(T_cw).cpu().numpy(),
+            is_keyframe=np.asarray([filler.is_keyframe(i) for i in self._indices]),
+        )
+
+    def _unfilled(
+        self, filler: Filler, reread: Callable[[], Iterable[Frame]]
+    ) -> Iterator[Encoded]:
+        """Every frame that is no keyframe, from memory or from a second pass."""
+        if len(self._kept) == len(self._indices):
+            blank = torch.zeros(0)
+            for index, time in zip(self._indices, self._times, strict=True):
+                if not filler.is_keyframe(index):
+                    yield Encoded(Frame(index, time, blank, blank), self._kept[index])
+            return
+        known = set(self._indices)
+        for frame in reread():
+            if frame.index in known and not filler.is_keyframe(frame.index):
+                held = self._kept.get(frame.index)
+                yield self._encode(frame) if held is None else Encoded(frame, held)
+
+    def _records(self) -> tuple[tuple[KeyframeRecord, ...], CloudPoints]:
+        store, cloud = self.store, self.config.cloud
+        if len(store) == 0:
+            return (), static_cloud(store, torch.zeros(0), torch.zeros(0), cloud)
+        valid = consistent_depth(store, cloud.relative_threshold, cloud.min_views)
+        weight = self.optimiser.gates()
+        T_wc = inv(store.T_cw.double()).cpu().numpy()  # noqa: N806
+        intrinsics = store.image_intrinsics.double().cpu().numpy()
+        records = tuple(
+            KeyframeRecord(
+                index=info.index,
+                time=info.time,
+                name=info.name,
+                image=info.image,
+                T_wc=T_wc[n],
+                intrinsics=intrinsics,
+                disp=store.disps[n].float().cpu().numpy().copy(),
+                depth_valid=valid[n].cpu().numpy(),
+                uncertainty=store["uncertainty"][n].float().cpu().numpy().copy(),
+                weight=weight[n].float().cpu().numpy().copy(),
+            )
+            for n, info in enumerate(store.infos)
+        )
+        return records, static_cloud(store, valid, weight, cloud)
+
+
+def _nbytes(payload: object) -> int:
+    """Bytes of the arrays and tensors that a payload holds directly."""
+    values = payload if isinstance(payload, (list, tuple)) else vars(payload).values()
+    return sum(int(getattr(value, "nbytes", 0)) for value in values)

@@ -1,0 +1,330 @@
+"""Implementation of correspondence `flow`."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate, Motion, Purpose
+
+if TYPE_CHECKING:
+    from droidw.geometry.camera import Grid
+    from droidw.slam.frame import Frame
+    from droidw_plugins.correspondence.flow import FlowOptions
+
+Array = npt.NDArray[np.float32]
+
+# Flow fields kept at full size between the motion filter and the edges that want them.
+_FULL_FIELDS = 24
+# Grid flows kept for the filler: some ten kilobytes each.
+_GRID_FIELDS = 20_000
+
+
+@dataclass(frozen=True)
+class FlowFrame:
+    """Payload of one frame: grey image [H,W] uint8 and texture [h,w,2] at the cells.
+
+    `texture` is the root mean square image derivative along x and along y, in grey levels per
+    pixel, over the neighbourhood of a cell.
+    """
+
+    index: int
+    grey: npt.NDArray[np.uint8]
+    texture: Array
+    centres: Array
+    stride: int
+
+
+@dataclass
+class _Edge:
+    """What is known of one directed edge: displacement and confidence on the grid."""
+
+    target: Array
+    confidence: Array
+    started: Array | None
+    searches: int = 1
+
+
+class FlowCorrespondence:
+    """Measures flow between pairs of frames with a small pool of threads."""
+
+    def __init__(self, options: FlowOptions) -> None:
+        self.options = options
+        self.stride = options.stride
+        self.offset = (options.stride - 1) / 2
+        workers = options.workers or os.cpu_count() or 1
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
+        self._local = threading.local()
+        self._lock = threading.Lock()
+        self._full: OrderedDict[tuple[int, int], Array] = OrderedDict()
+        self._grid: OrderedDict[tuple[int, int], tuple[Array, Array]] = OrderedDict()
+
+    def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
+        """Grey image and texture at the cells."""
+        rgb = frame.image.permute(1, 2, 0).numpy()
+        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        centres = grid.centres().numpy().astype(np.float32)
+        window = (2 * self.stride - 1, 2 * self.stride - 1)
+        scaled = grey * np.float32(255.0)
+        texture = []
+        for dx, dy in ((1, 0), (0, 1)):
+            slope = cv2.Scharr(scaled, cv2.CV_32F, dx, dy, scale=1 / 32)
+            energy = cv2.blur(slope * slope, window, borderType=cv2.BORDER_REPLICATE)
+            texture.append(np.sqrt(_at(energy, centres)))
+        grey8 = np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
+        return FlowFrame(frame.index, grey8, np.stack(texture, -1), centres, self.stride)
+
+    def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:
+        """Nothing more is needed of a keyframe."""
+        return payload
+
+    def motion(self, reference: FlowFrame, current: FlowFrame) -> Motion:
+        """Flow from the reference, judged by brightness agreement only."""
+        flow = self._forward(reference, current)
+        moved, agrees = self._one_way(reference, current, flow)
+        return self._motion(moved, agrees, reference)
+
+    def session(self, purpose: Purpose = "window") -> _FlowSession:
+        """Fresh edge state; flows already measured are shared between sessions."""
+        return _FlowSession(self, one_way=purpose == "fill")
+
+    # -- measuring -------------------------------------------------------------------------
+
+    def _motion(self, moved: Array, agrees: Array, reference: FlowFrame) -> Motion:
+        textured = reference.texture.max(axis=-1) > 0.5 * self.options.texture
+        usable = textured & (agrees > 0.3)
+        matched = float(usable.mean())
+        if not usable.any():
+            return Motion(0.0, 0.0)
+        length = np.hypot(moved[..., 0], moved[..., 1])[usable]
+        if (length < self.options.still).mean() > self.options.still_share:
+            return Motion(float(np.median(length)) / self.stride, matched)
+        return Motion(float(length.mean()) / self.stride, matched)
+
+    def _search(self, a: FlowFrame, b: FlowFrame, start: Array | None = None) -> Array:
+        """Dense flow a -> b, [H,W,2] pixels."""
+        engine = getattr(self._local, "engine", None)
+        if engine is None:
+            engine = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+            engine.setFinestScale(self.options.finest_scale)
+            engine.setGradientDescentIterations(self.options.iterations)
+            engine.setVariationalRefinementIterations(self.options.refinement)
+            self._local.engine = engine
+        flow: Array = engine.calc(a.grey, b.grey, None if start is None else start.copy())
+        return flow
+
+    def _forward(self, a: FlowFrame, b: FlowFrame) -> Array:
+        """Unstarted flow a -> b, remembered for a while."""
+        key = (a.index, b.index)
+        with self._lock:
+            known = self._full.get(key)
+        if known is not None:
+            return known
+        flow = self._search(a, b)
+        with self._lock:
+            self._full[key] = flow
+            while len(self._full) > _FULL_FIELDS:
+                self._full.popitem(last=False)
+        return flow
+
+    def _one_way(self, a: FlowFrame, b: FlowFrame, flow: Array) -> tuple[Array, Array]:
+        """Displacement [h,w,2] px at the cells and brightness agreement [h,w] in [0,1]."""
+        key = (a.index, b.index)
+        with self._lock:
+            known = self._grid.get(key)
+        if known is not None:
+            return known
+        moved = _at(flow, a.centres)
+        agrees = self._agreement(a, b, moved)
+        with self._lock:
+            self._grid[key] = (moved, agrees)
+            while len(self._grid) > _GRID_FIELDS:
+                self._grid.popitem(last=False)
+        return moved, agrees
+
+    def _agreement(self, a: FlowFrame, b: FlowFrame, moved: Array) -> Array:
+        """Agreement in brightness at both ends of the flow, and 0 outside the picture."""
+        there = a.centres + moved
+        height, width = a.grey.shape
+        inside = (
+            (there[..., 0] >= 0)
+            & (there[..., 1] >= 0)
+            & (there[..., 0] <= width - 1)
+            & (there[..., 1] <= height - 1)
+        )
+        difference = np.abs(_at(a.grey, a.centres) - _at(b.grey, there))
+        # A change of brightness by 10 grey levels is worth two pixels of position where the
+        # picture is steep and says nothing where it is flat: texture decides there.
+        tolerance = 6.0 + 1.5 * a.texture.max(axis=-1)
+        agreement: Array = inside / (1.0 + (difference / tolerance) ** 2)
+        return agreement.astype(np.float32)
+
+    def one_way(self, a: FlowFrame, b: FlowFrame) -> _Edge:
+        """Edge a -> b without the way back."""
+        key = (a.index, b.index)
+        with self._lock:
+            known = self._grid.get(key)
+        if known is None:
+            known = self._one_way(a, b, self._search(a, b))
+        moved, agrees = known
+        confidence = agrees[..., None] * self._texture_weight(a)
+        return _Edge((a.centres + moved - self.offset) / self.stride, confidence, None)
+
+    def both_ways(
+        self, a: FlowFrame, b: FlowFrame, start_ab: Array | None, start_ba: Array | None
+    ) -> tuple[_Edge, _Edge]:
+        """Edges a -> b and b -> a, each checked against the other."""
+        if start_ab is None:
+            ab = self._forward(a, b)
+        else:
+            ab = self._search(a, b, self._dense(start_ab, a))
+        if start_ba is None:
+            ba = self._forward(b, a)
+        else:
+            ba = self._search(b, a, self._dense(start_ba, b))
+        return self._checked(a, ab, ba, start_ab), self._checked(b, ba, ab, start_ba)
+
+    def _dense(self, target: Array, a: FlowFrame) -> Array:
+        """Grid targets [h,w,2] in cells as a full flow field [H,W,2] in pixels."""
+        flow = target * self.stride + self.offset - a.centres
+        height, width = a.grey.shape
+        rows = np.float32(np.clip((np.arange(height) - self.offset) / self.stride, 0, None))
+        cols = np.float32(np.clip((np.arange(width) - self.offset) / self.stride, 0, None))
+        map_x, map_y = np.meshgrid(cols, rows)
+        dense: Array = cv2.remap(
+            np.ascontiguousarray(flow, dtype=np.float32), map_x, map_y, cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        return np.clip(dense, -2.0 * width, 2.0 * width)
+
+    def _checked(self, a: FlowFrame, ab: Array, ba: Array, started: Array | None) -> _Edge:
+        moved = _at(ab, a.centres)
+        there = a.centres + moved
+        back = _at(ba, there, outside=1e4)
+        error2 = ((moved + back) ** 2).sum(axis=-1)
+        opt = self.options
+        confidence = 1.0 / (1.0 + error2 / opt.consistency**2)
+        confidence[error2 > opt.cutoff**2] = 0.0
+        weight = confidence[..., None].astype(np.float32) * self._texture_weight(a)
+        return _Edge((there - self.offset) / self.stride, weight, started)
+
+    def _texture_weight(self, a: FlowFrame) -> Array:
+        if self.options.texture <= 0:
+            return np.ones_like(a.texture)
+        t2 = a.texture**2
+        weight: Array = t2 / (t2 + np.float32(self.options.texture**2))
+        return weight
+
+    def map(self, jobs: list[Callable[[], Any]]) -> list[Any]:
+        """Run jobs on the pool, results in order."""
+        if len(jobs) < 2:
+            return [job() for job in jobs]
+        return list(self._pool.map(lambda job: job(), jobs))
+
+
+class _FlowSession:
+    """Edges measured once, and again when geometry says that the search went elsewhere."""
+
+    def __init__(self, owner: FlowCorrespondence, *, one_way: bool) -> None:
+        self._owner = owner
+        self._one_way = one_way
+        self._edges: dict[int, _Edge] = {}
+
+    def forget(self, ids: list[int]) -> None:
+        """Drop edges."""
+        for edge_id in ids:
+            self._edges.pop(edge_id, None)
+
+    def update(self, request: EdgeRequest) -> EdgeUpdate:
+        """Measure what is new or has moved away; return the state of all edges."""
+        coords = request.coords.detach().cpu().numpy()
+        wanted = [
+            row
+            for row, edge_id in enumerate(request.ids)
+            if edge_id not in self._edges or self._astray(self._edges[edge_id], coords[row], request)
+        ]
+        if self._one_way:
+            self._measure_one_way(request, wanted)
+        else:
+            self._measure_pairs(request, wanted, coords)
+        edges = [self._edges[edge_id] for edge_id in request.ids]
+        device = request.coords.device
+        target = torch.from_numpy(np.stack([e.target for e in edges])).to(device)
+        confidence = torch.from_numpy(np.stack([e.confidence for e in edges])).to(device)
+        return EdgeUpdate(target, confidence)
+
+    def _astray(self, edge: _Edge, coords: Array, request: EdgeRequest) -> bool:
+        """Whether most confident cells lie far from the prediction of good geometry."""
+        opt = self._owner.options
+        if self._one_way or not request.informed or edge.searches > opt.restarts:
+            return False
+        sure = edge.confidence.max(axis=-1) > 0.1
+        if sure.mean() < 0.02:
+            return True
+        away = np.abs(coords - edge.target).max(axis=-1)
+        return bool(np.median(away[sure]) > opt.restart)
+
+    def _measure_one_way(self, request: EdgeRequest, wanted: list[int]) -> None:
+        def job(row: int) -> Callable[[], _Edge]:
+            a, b = request.payload(request.ii[row]), request.payload(request.jj[row])
+            return lambda: self._owner.one_way(a, b)
+
+        for row, edge in zip(wanted, self._owner.map([job(r) for r in wanted]), strict=True):
+            self._edges[request.ids[row]] = edge
+
+    def _measure_pairs(self, request: EdgeRequest, wanted: list[int], coords: Array) -> None:
+        """One job per unordered pair, since the check needs both directions anyway."""
+        pairs: dict[tuple[int, int], dict[bool, int]] = {}
+        for row in wanted:
+            i, j = request.ii[row], request.jj[row]
+            pairs.setdefault((min(i, j), max(i, j)), {})[i < j] = row
+
+        def start(row: int | None) -> Array | None:
+            if row is None or not request.informed:
+                return None
+            valid = request.valid[row].cpu().numpy()
+            return coords[row] if valid.mean() > 0.5 else None
+
+        def job(key: tuple[int, int], rows: dict[bool, int]) -> Callable[[], Any]:
+            a, b = request.payload(key[0]), request.payload(key[1])
+            starts = start(rows.get(True)), start(rows.get(False))
+            return lambda: self._owner.both_ways(a, b, *starts)
+
+        measured = self._owner.map([job(key, rows) for key, rows in pairs.items()])
+        for rows, both in zip(pairs.values(), measured, strict=True):
+            for forward, row in rows.items():
+                edge = both[0 if forward else 1]
+                old = self._edges.get(request.ids[row])
+                edge.searches = old.searches + 1 if old else 1
+                self._edges[request.ids[row]] = edge
+
+
+def _at(values: Any, points: Array, outside: float | None = None) -> Array:
+    """Bilinear samples of [H,W(,C)] at points [h,w,2]; edge values (or `outside`) beyond."""
+    mode = cv2.BORDER_REPLICATE if outside is None else cv2.BORDER_CONSTANT
+    sampled: Array = cv2.remap(
+        values,
+        np.ascontiguousarray(points[..., 0], dtype=np.float32),
+        np.ascontiguousarray(points[..., 1], dtype=np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=mode,
+        borderValue=(outside or 0.0,) * 4,
+    )
+    return sampled.astype(np.float32, copy=False)
+
+
+def as_numpy(values: Tensor) -> Array:
+    """A float32 array of a tensor, for OpenCV."""
+    array: Array = values.detach().cpu().numpy().astype(np.float32, copy=False)
+    return array

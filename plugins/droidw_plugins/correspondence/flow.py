@@ -1,0 +1,71 @@
+"""Correspondence `flow`: dense inverse search optical flow, the default that needs no download."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from droidw.interfaces.correspondence import Correspondence
+from droidw.plugin.component import BuildContext, Component
+
+__all__ = ["COMPONENT", "FlowOptions"]
+
+
+@dataclass(frozen=True)
+class FlowOptions:
+    """Options of correspondence `flow`; lengths in pixels of the working image."""
+
+    stride: int = field(default=8, metadata={"help": "grid cell in pixels", "ge": 2, "le": 16})
+    finest_scale: int = field(
+        default=1,
+        metadata={"help": "finest pyramid level of the search (0: full size)", "ge": 0, "le": 3},
+    )
+    iterations: int = field(
+        default=12, metadata={"help": "gradient descent iterations per patch", "ge": 1, "le": 100}
+    )
+    refinement: int = field(
+        default=5, metadata={"help": "variational refinement iterations", "ge": 0, "le": 20}
+    )
+    consistency: float = field(
+        default=0.5,
+        metadata={"help": "forward-backward error at which confidence halves", "gt": 0.0},
+    )
+    cutoff: float = field(
+        default=3.0, metadata={"help": "forward-backward error without any confidence", "gt": 0.0}
+    )
+    texture: float = field(
+        default=4.0,
+        metadata={"help": "image gradient (grey levels) at which confidence halves", "ge": 0.0},
+    )
+    restart: float = field(
+        default=2.0,
+        metadata={"help": "cells between prediction and measurement that repeat a search",
+                  "gt": 0.0},
+    )
+    restarts: int = field(default=1, metadata={"help": "repeated searches per edge", "ge": 0})
+    still: float = field(
+        default=0.35, metadata={"help": "flow that counts as no motion, in pixels", "ge": 0.0}
+    )
+    still_share: float = field(
+        default=0.55,
+        metadata={"help": "share of unmoved cells that means a camera at rest", "gt": 0, "le": 1},
+    )
+    workers: int = field(default=0, metadata={"help": "threads (0: one per core)", "ge": 0})
+
+
+def _build(options: Any, context: BuildContext) -> Correspondence:
+    from droidw_plugins.correspondence._flow import FlowCorrespondence
+
+    return FlowCorrespondence(options)
+
+
+COMPONENT: Component[Correspondence] = Component(
+    name="flow",
+    summary="dense inverse search optical flow both ways, started from the predicted flow",
+    factory=_build,
+    options=FlowOptions,
+    requires=("cv2",),
+    capabilities=frozenset({"cpu", "threads"}),
+    reference="Kroeger et al., Fast Optical Flow using Dense Inverse Search, ECCV 2016; "
+    "OpenCV's implementation (Apache-2.0)",
+)
