@@ -206,7 +206,7 @@ def _poly(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:
 def _half_sinc(theta2: Tensor) -> Tensor:
     """sin(theta/2)/theta as a series in theta^2, for theta^2 below `_SERIES_BELOW`."""
     x = 0.25 * theta2
-    return 0.5 * _poly(x, (1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800))
+    return _poly(x, (1 / 2, -1 / 12, 1 / 240, -1 / 10080, 1 / 725760, -1 / 79833600))
 
 
 def _half_cos(theta2: Tensor) -> Tensor:
@@ -217,8 +217,10 @@ def _half_cos(theta2: Tensor) -> Tensor:
 
 def _rotate(q: Tensor, v: Tensor) -> Tensor:
     """Vectors [..., 3] rotated by quaternions [..., 4] of the same leading shape."""
-    u = 2.0 * torch.linalg.cross(q[..., :3], v, dim=-1)
-    return v + q[..., 3:] * u + torch.linalg.cross(q[..., :3], u, dim=-1)
+    axis, w = q[..., :3], q[..., 3:]
+    u = torch.linalg.cross(axis + axis, v, dim=-1)
+    rotated: Tensor = v + w * u + torch.linalg.cross(axis, u, dim=-1)
+    return rotated
 
 
 def _quat_mul(p: Tensor, q: Tensor) -> Tensor:

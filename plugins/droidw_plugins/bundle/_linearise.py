@@ -1,0 +1,248 @@
+"""Per-edge normal equations of the reprojection error, with respect to the target's pose alone.
+
+The Jacobian of the source's pose follows from J_i = -Ad(G_ij)^T J_j, so one set of sums per edge
+is enough (REFERENCE 2.3); `_schur` turns 6x6 blocks instead of planes of cells.
+
+Rows are kept in normalised image units and with the signs of two components (t_z, phi_x)
+turned, since that saves passes over the planes; `SIGNS` takes them back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from droidw.geometry import se3
+from droidw.geometry.projective import NEAR, pixel_grid
+from droidw.solve.problem import BAProblem
+from droidw_plugins.bundle._layout import Layout, Workspace
+
+__all__ = ["SIGNS", "EdgeSums", "energy", "linearise"]
+
+SIGNS = (1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
+"""What the six pose components of every sum are multiplied by, once per component."""
+
+# Rows of the u and v parts: five pose components that are not 0, J_z, residual.
+_U_ROWS = (0, 2, 3, 4, 5, 6, 7)
+_V_ROWS = (1, 2, 3, 4, 5, 6, 7)
+
+
+@dataclass(frozen=True)
+class EdgeSums:
+    """Sums over the cells of each edge, in the order of the layout.
+
+    Attributes:
+        gram: [E,8,8] float64, of the weighted rows (six pose components, J_z, residual).
+        coupling: [E,6,P] sum over x/y of W J_z J_j, or None if depths stay.
+        depth: [E,2,P] sums over x/y of W J_z^2 and W J_z r, or None if depths stay.
+        valid: [E,P] 1 where the cell passes the near test, else 0; None unless asked for.
+    """
+
+    gram: Tensor
+    coupling: Tensor | None
+    depth: Tensor | None
+    valid: Tensor | None
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """A run of edges with the projection of their cells and the residual, in cells."""
+
+    part: slice
+    d: Tensor  # [n,P] disparity in the source
+    a: Tensor  # [n,P] X / Z
+    b: Tensor  # [n,P] Y / Z
+    inv_z: Tensor  # [n,P] 1 / Z, with Z clamped to NEAR
+    ok: Tensor  # [n,P] 1 where Z >= NEAR
+    weight: Tensor  # [n,P,2]
+    r: Tensor  # [n,2,P]
+
+
+def linearise(
+    problem: BAProblem, layout: Layout, G: Tensor, work: Workspace, chunk: int, keep_valid: bool
+) -> EdgeSums:
+    """Normal equations of every edge.
+
+    Args:
+        problem: its target and weight should be finite; if not, `gram` is not finite either.
+        layout: order of the edges.
+        G: [E,7] float64 relative poses of the sorted edges.
+        work: scratch space; `coupling`, `depth` and `valid` live in it.
+        chunk: cells worked on at a time.
+        keep_valid: fill `valid`.
+    """
+    like = problem.disps
+    n_edges, n_cells = layout.ii.shape[0], like.shape[-2] * like.shape[-1]
+    fx, fy, _, _ = problem.intrinsics.tolist()
+    gram = torch.zeros(n_edges, 8, 8, dtype=torch.float64, device=like.device)
+    coupling = depth = None
+    if not problem.motion_only:
+        coupling = work.take("coupling", n_edges, 6, n_cells, like=like)
+        depth = work.take("depth", n_edges, 2, n_cells, like=like)
+    valid = work.take("valid", n_edges, n_cells, like=like) if keep_valid else None
+    u_rows = torch.tensor(_U_ROWS, device=like.device)
+    v_rows = torch.tensor(_V_ROWS, device=like.device)
+    u_signs = torch.ones(7, dtype=torch.float64, device=like.device)
+    u_signs[4] = -1.0
+    t = G[:, :3].to(like.dtype)
+    for c in _project(problem, layout, problem.T_cw, problem.disps, work, chunk, G):
+        n = c.d.shape[0]
+        rows = work.take("rows", n, 2, 7, n_cells, like=like)
+        _weighted_rows(c, t[c.part], fx, fy, problem.huber, rows, work, problem.motion_only)
+        flat = rows.view(2 * n, 7, n_cells)
+        products = torch.bmm(flat, flat.transpose(1, 2)).view(n, 2, 7, 7).double()
+        out = gram[c.part]
+        out[:, u_rows[:, None], u_rows] = products[:, 0] * u_signs * u_signs[:, None]
+        out[:, v_rows[:, None], v_rows] += products[:, 1]
+        if coupling is not None and depth is not None:
+            _depth_products(rows, coupling[c.part], depth[c.part])
+        if valid is not None:
+            valid[c.part] = c.ok
+    return EdgeSums(gram, coupling, depth, valid)
+
+
+def energy(
+    problem: BAProblem,
+    layout: Layout,
+    T_cw: Tensor,
+    disps: Tensor,
+    valid: Tensor,
+    work: Workspace,
+    chunk: int,
+) -> float:
+    """Robust reprojection energy of other poses and depths, summed in float64.
+
+    Counts exactly the cells of `valid`, those that passed the near test at the start of the
+    step; one that has come too near since is charged at its clamped depth, so that nothing is
+    gained by pushing points behind a camera.
+    """
+    total = torch.zeros((), dtype=torch.float64, device=disps.device)
+    for c in _project(problem, layout, T_cw, disps, work, chunk, None):
+        weight = c.weight.transpose(1, 2)
+        squared = c.r * c.r
+        if problem.huber is not None:
+            length = squared.sum(1).sqrt_()
+            knee = (problem.huber / length.clamp_min(problem.huber)).unsqueeze(1)
+            squared *= knee * (2.0 - knee)  # 1 inside the threshold, (2hs - h^2) / s^2 outside
+        squared *= weight
+        squared *= valid[c.part].unsqueeze(1)
+        total += squared.sum((1, 2)).double().sum()
+    return float(total)
+
+
+def _project(
+    problem: BAProblem,
+    layout: Layout,
+    T_cw: Tensor,
+    disps: Tensor,
+    work: Workspace,
+    chunk: int,
+    G: Tensor | None,
+) -> Iterator[_Chunk]:
+    """Projects the cells of every edge, a run of edges at a time, into reused buffers."""
+    like = problem.disps
+    h, w = like.shape[-2:]
+    n_edges, n_cells = layout.ii.shape[0], h * w
+    fx, fy, cx, cy = problem.intrinsics.tolist()
+    if G is None:
+        T64 = T_cw.double()
+        G = se3.mul(T64[layout.jj], se3.inv(T64[layout.ii]))
+    R, t = se3.rotation(G).to(like.dtype), G[:, :3].to(like.dtype)
+    rays = torch.ones(3, n_cells, dtype=like.dtype, device=like.device)
+    xy = pixel_grid(h, w, like.dtype, like.device).view(-1, 2)
+    torch.div(xy[:, 0] - cx, fx, out=rays[0])
+    torch.div(xy[:, 1] - cy, fy, out=rays[1])
+    flat = disps.reshape(-1, n_cells)
+    targets = problem.target.reshape(-1, 2 * n_cells)
+    weights = problem.weight.reshape(-1, 2 * n_cells)
+    size = max(1, chunk // n_cells)
+    for start in range(0, n_edges, size):
+        part = slice(start, min(start + size, n_edges))
+        n = part.stop - part.start
+        index = layout.order[part]
+        d = work.take("d", n, n_cells, like=like)
+        torch.index_select(flat, 0, layout.ii[part], out=d)
+        target = work.take("target", n, 2 * n_cells, like=like)
+        torch.index_select(targets, 0, index, out=target)
+        weight = work.take("weight", n, 2 * n_cells, like=like)
+        torch.index_select(weights, 0, index, out=weight)
+        points = work.take("points", n, 3, n_cells, like=like)
+        torch.mm(R[part].reshape(-1, 3), rays, out=points.view(-1, n_cells))
+        points.addcmul_(t[part, :, None], d[:, None])
+        a, b, Z = points.unbind(1)
+        ok = work.take("ok", n, n_cells, like=like)
+        torch.ge(Z, NEAR, out=ok)
+        inv_z = Z.clamp_(min=NEAR).reciprocal_()
+        points[:, :2] *= inv_z[:, None]
+        r = work.take("residual", n, 2, n_cells, like=like)
+        target = target.view(n, n_cells, 2)
+        torch.add(target[..., 0], a, alpha=-fx, out=r[:, 0])
+        torch.add(target[..., 1], b, alpha=-fy, out=r[:, 1])
+        r[:, 0] -= cx
+        r[:, 1] -= cy
+        yield _Chunk(part, d, a, b, inv_z, ok, weight.view(n, n_cells, 2), r)
+
+
+def _weighted_rows(
+    c: _Chunk,
+    t: Tensor,
+    fx: float,
+    fy: float,
+    huber: float | None,
+    rows: Tensor,
+    work: Workspace,
+    motion_only: bool,
+) -> None:
+    """Fills rows [n,2,7,P] with sqrt(W) times the Jacobian and the residual (REFERENCE 2.3)."""
+    n, n_cells = c.d.shape
+    root = work.take("root", n, 2, n_cells, like=c.d)
+    torch.mul(c.weight.transpose(1, 2), c.ok[:, None], out=root)
+    if huber is not None:
+        # iteratively reweighted least squares: weight h / |r| beyond the threshold
+        length = torch.hypot(c.r[:, 0], c.r[:, 1])
+        root *= (huber / length.clamp_(min=huber)).unsqueeze(1)
+    root.sqrt_()
+    torch.mul(root, c.r, out=rows[:, :, 6])
+    root[:, 0] *= fx
+    root[:, 1] *= fy
+    e = work.take("e", n, n_cells, like=c.d)
+    torch.mul(c.d, c.inv_z, out=e)
+    u, v, su, sv = rows[:, 0], rows[:, 1], root[:, 0], root[:, 1]
+    torch.mul(root, e[:, None], out=rows[:, :, 0])
+    torch.mul(u[:, 0], c.a, out=u[:, 1])
+    torch.mul(v[:, 0], c.b, out=v[:, 1])
+    torch.mul(su, c.b, out=u[:, 4])
+    torch.mul(sv, c.a, out=v[:, 4])
+    torch.mul(u[:, 4], c.a, out=u[:, 2])
+    torch.mul(v[:, 4], c.b, out=v[:, 3])
+    torch.mul(su, c.a, out=e)
+    torch.addcmul(su, c.a, e, out=u[:, 3])
+    torch.mul(sv, c.b, out=e)
+    torch.addcmul(sv, c.b, e, out=v[:, 2])
+    if motion_only:
+        rows[:, :, 5] = 0.0
+        return
+    # J_z: (t_x - t_z a) / Z and (t_y - t_z b) / Z
+    tz = t[:, 2:]
+    root *= c.inv_z[:, None]
+    torch.addcmul(t[:, :1], c.a, tz, value=-1.0, out=e)
+    torch.mul(su, e, out=u[:, 5])
+    torch.addcmul(t[:, 1:2], c.b, tz, value=-1.0, out=e)
+    torch.mul(sv, e, out=v[:, 5])
+
+
+def _depth_products(rows: Tensor, coupling: Tensor, depth: Tensor) -> None:
+    """W J_z J_j into coupling [n,6,P]; W J_z^2 and W J_z r into depth [n,2,P]."""
+    u, v = rows[:, 0], rows[:, 1]
+    ju, jv = u[:, 5:6], v[:, 5:6]
+    torch.mul(u[:, 0], u[:, 5], out=coupling[:, 0])
+    torch.mul(v[:, 0], v[:, 5], out=coupling[:, 1])
+    torch.mul(u[:, 1:4], ju, out=coupling[:, 2:5])
+    coupling[:, 2:5].addcmul_(v[:, 1:4], jv)
+    torch.mul(v[:, 4], v[:, 5], out=coupling[:, 5])
+    coupling[:, 5].addcmul_(u[:, 4], u[:, 5], value=-1.0)
+    torch.mul(u[:, 5:7], ju, out=depth)
+    depth.addcmul_(v[:, 5:7], jv)
