@@ -21,6 +21,8 @@ def test_nothing_is_unfinished(host, builtins):
         for number, line in enumerate(source.text.splitlines(), 1):
             if UNFINISHED.search(line):
                 wrong.append(f"{source.where}:{number}: {line.strip()}")
+        if source.module == "droidw.plugin.hookspecs":
+            continue  # a hookspec is a signature and a docstring; pluggy never calls its body
         wrong += [
             f"{source.where}:{node.lineno}: NotImplementedError"
             for node in ast.walk(source.tree)

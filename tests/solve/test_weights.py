@@ -19,7 +19,8 @@ def test_gate_falls_and_stays_in_range() -> None:
     u = torch.linspace(0, 20, 500)
     for kind in ("rational", "inverse", "none"):
         g = gate(u, kind)  # type: ignore[arg-type]
-        assert float(g.min()) >= 0.0 and float(g.max()) <= 1.0
+        assert float(g.min()) >= 0.0
+        assert float(g.max()) <= 1.0
         assert bool((g[1:] <= g[:-1]).all())
         assert float(g[0]) == 1.0
 
@@ -53,7 +54,8 @@ def test_weights_multiply_scale_gate_of_the_source_and_validity() -> None:
     weight = residual_weights(confidence, valid, gates, ii, jj, target, scale=0.001)
     assert torch.allclose(weight, 0.001 * confidence * (gates[ii] * valid)[..., None])
     plain = residual_weights(confidence, None, None, ii, jj, target)
-    assert torch.equal(plain, confidence) and plain is not confidence
+    assert torch.equal(plain, confidence)
+    assert plain is not confidence
 
 
 def test_bidirectional_gate_is_sampled_at_the_target_and_one_outside() -> None:
