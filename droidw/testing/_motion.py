@@ -91,7 +91,7 @@ def _orbit(t: float, phases: Array) -> Pose:
 
 def _forward(t: float, phases: Array) -> Pose:
     shift, turn = _shake(t, phases)
-    centre = np.array([0.1 * sin(0.7 * t), 0.0, -0.9 - 0.8 * cos(0.5 * t)])
+    centre = np.array([0.1 * sin(0.7 * t), 0.0, -1.25 - 0.55 * cos(0.6 * t)])
     return Pose(rotation(*turn), centre + shift)
 
 

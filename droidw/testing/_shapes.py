@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from droidw.testing._motion import Pose
 
-Array = npt.NDArray[np.floating]
+Array = npt.NDArray[np.floating[Any]]
+Whole = npt.NDArray[np.integer[Any]]
 
 __all__ = ["TEXEL", "UV_AXES", "Body", "Hits", "face_size"]
 
@@ -48,7 +50,7 @@ class Body:
         """Of a ball around the origin that holds the body."""
         return float(self.half[0] if self.kind == "ball" else np.linalg.norm(self.half))
 
-    def intersect(self, origin: Array, rays: Array) -> tuple[Array, Array]:
+    def intersect(self, origin: Array, rays: Array) -> tuple[Array, Whole]:
         """Nearest hit in front: parameter t [N] (inf where missed) and face [N] (int).
 
         Args:
@@ -61,22 +63,19 @@ class Body:
             inverse = 1 / rays
         ahead = rays > 0
         edge = np.where(ahead, half[:, None], -half[:, None]) - origin[:, None]
-        if self.kind == "room":
-            leave = np.where(rays == 0, np.inf, edge * inverse)
-            axis = np.argmin(leave, axis=0)
-            face = 2 * axis + np.take_along_axis(ahead, axis[None], 0)[0]
-            return np.take_along_axis(leave, axis[None], 0)[0], face
         far = np.where(rays == 0, np.inf, edge * inverse)
+        if self.kind == "room":
+            axis = np.argmin(far, axis=0)
+            return _pick(far, axis), 2 * axis + _pick(ahead, axis)
         near = (np.where(ahead, -half[:, None], half[:, None]) - origin[:, None]) * inverse
         near = np.where(rays == 0, np.where(np.abs(origin)[:, None] < half[:, None],
                                             -np.inf, np.inf), near)
         axis = np.argmax(near, axis=0)
-        enter = np.take_along_axis(near, axis[None], 0)[0]
+        enter = _pick(near, axis)
         hit = (enter < far.min(axis=0)) & (enter > 0)
-        face = 2 * axis + ~np.take_along_axis(ahead, axis[None], 0)[0]
-        return np.where(hit, enter, np.inf), face
+        return np.where(hit, enter, np.inf), 2 * axis + ~_pick(ahead, axis)
 
-    def _ball(self, origin: Array, rays: Array) -> tuple[Array, Array]:
+    def _ball(self, origin: Array, rays: Array) -> tuple[Array, Whole]:
         a = (rays * rays).sum(axis=0)
         b = (rays * origin[:, None]).sum(axis=0)
         c = float(origin @ origin) - float(self.half[0]) ** 2
@@ -85,21 +84,24 @@ class Body:
         t = np.where((inside > 0) & (t > 0), t, np.inf)
         point = origin[:, None] + np.where(np.isfinite(t), t, 0) * rays
         axis = np.argmax(np.abs(point), axis=0)
-        face = 2 * axis + (np.take_along_axis(point, axis[None], 0)[0] > 0)
+        face = 2 * axis + (_pick(point, axis) > 0)
         return t, face
 
-    def texel(self, point: Array, face: Array) -> tuple[Array, Array]:
+    def texel(self, point: Array, face: Whole) -> tuple[Array, Array]:
         """Texture coordinates [N] x, y of surface points [3,N] in the body's coordinates."""
         axis = face // 2
         if self.kind == "ball":
             # As if blown up onto its cube; the texture is as large as the cube's face.
-            longest = np.abs(np.take_along_axis(point, axis[None], 0))
+            longest = np.abs(_pick(point, axis))
             point = point / longest * self.half[0].astype(point.dtype)
         table = np.array(UV_AXES)
         shifted = (point + self.half.astype(point.dtype)[:, None]) / TEXEL
-        x = np.take_along_axis(shifted, table[axis, 0][None], 0)[0]
-        y = np.take_along_axis(shifted, table[axis, 1][None], 0)[0]
-        return x, y
+        return _pick(shifted, table[axis, 0]), _pick(shifted, table[axis, 1])
+
+
+def _pick(rows: npt.NDArray[Any], which: Whole) -> npt.NDArray[Any]:
+    """Entry `which[n]` of every column n of [3,N]; faster than `take_along_axis`."""
+    return np.asarray(np.where(which == 0, rows[0], np.where(which == 1, rows[1], rows[2])))
 
 
 @dataclass
@@ -132,7 +134,7 @@ def cast(bodies: list[Body], poses: list[Pose], camera: Pose, intrinsics: Array,
     dtype = x.dtype
     fx, fy, cx, cy = (dtype.type(v) for v in intrinsics)
     rays_c = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)])
-    length = np.sqrt((rays_c * rays_c).sum(axis=0))
+    length = np.sqrt(rays_c[0] ** 2 + rays_c[1] ** 2 + 1)
     count = len(x)
     hits = Hits(np.full(count, np.inf, dtype), np.full(count, -1, np.int16),
                 np.zeros(count, np.int16), np.zeros((3, count), dtype), np.ones(count, dtype))
@@ -144,21 +146,20 @@ def cast(bodies: list[Body], poses: list[Pose], camera: Pose, intrinsics: Array,
         origin = (pose.R.T @ (camera.t - pose.t)).astype(dtype)
         rays = turn @ (rays_c if chosen is None else rays_c[:, chosen])
         t, face = body.intersect(origin, rays)
-        if chosen is None:
-            closer = np.flatnonzero(t < hits.depth)
-            target = closer
+        target: Whole | slice
+        if number == 0 and chosen is None:  # the room: hit by all, and nothing was before it
+            target = slice(None)
         else:
-            closer = np.flatnonzero(t < hits.depth[chosen])
-            target = chosen[closer]
-        if len(closer) == 0:
-            continue
-        if len(closer) < len(t):
+            closer = np.flatnonzero(t < (hits.depth if chosen is None else hits.depth[chosen]))
+            if len(closer) == 0:
+                continue
+            target = closer if chosen is None else chosen[closer]
             t, face, rays = t[closer], face[closer], rays[:, closer]
         point = origin[:, None] + t * rays
         if body.kind == "ball":
             slant = np.abs((point * rays).sum(axis=0)) / dtype.type(body.half[0])
         else:
-            slant = np.abs(np.take_along_axis(rays, (face // 2)[None], 0)[0])
+            slant = np.abs(_pick(rays, face // 2))
         hits.depth[target], hits.body[target], hits.face[target] = t, number, face
         hits.point[:, target], hits.slant[target] = point, slant / length[target]
     return hits

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -44,7 +45,8 @@ def _corner_shade(height: int, width: int, strength: float = 0.28, reach: float 
     x = np.arange(width, dtype=np.float32)
     near_y = np.exp(-np.minimum(y, height - 1 - y) / reach)
     near_x = np.exp(-np.minimum(x, width - 1 - x) / reach)
-    return (1 - strength * np.maximum(near_y[:, None], near_x[None, :]))[..., None]
+    shade = 1 - strength * np.maximum(near_y[:, None], near_x[None, :])
+    return shade[..., None].astype(np.float32)
 
 
 def _soften(image: Image, sigma: float = 0.8) -> Image:
@@ -105,9 +107,9 @@ def planks(rng: np.random.Generator, height: int, width: int) -> Image:
                 image[y:y + board, x:x + 2] *= 0.5
             x += length
         image[y:y + 2] *= 0.5
-    grain = noise(rng, height, width // 5 + 1, 14, 4, 0.8)
-    grain = cv2.resize(grain, (width, height), interpolation=cv2.INTER_CUBIC)[..., None]
-    image *= 1 + 0.30 * grain
+    short = noise(rng, height, width // 5 + 1, 14, 4, 0.8)
+    grain = cv2.resize(short, (width, height), interpolation=cv2.INTER_CUBIC)
+    image *= (1 + 0.30 * grain[..., None]).astype(np.float32)
     image *= 1 + 0.25 * noise(rng, height, width, 90, 3)
     return _soften(image * _corner_shade(height, width))
 
@@ -144,24 +146,25 @@ def furniture(rng: np.random.Generator, height: int, width: int) -> Image:
 
 def fabric(rng: np.random.Generator, height: int, width: int) -> Image:
     """What moving objects wear: warped stripes, blobs and noise in lively colours."""
-    first, second = _colour(rng, 60, 120, 60), _colour(rng, 140, 220, 50)
+    first, second = _colour(rng, 55, 110, 40), _colour(rng, 130, 190, 35)
     y, x = np.mgrid[:height, :width].astype(np.float32)
     bend = 60 * noise(rng, height, width, 70, 2)[..., 0]
     angle = rng.uniform(0, np.pi)
     phase = (np.cos(angle) * x + np.sin(angle) * y + bend) / rng.uniform(5.0, 8.0)
     mix = np.clip(1.5 * np.sin(phase) + 0.5, 0, 1)[..., None]
     image = first * (1 - mix) + second * mix
-    image += 60 * noise(rng, height, width, 24, 4, 0.75, 3)
-    for _ in range(max(3, height * width // 2500)):
+    image += 45 * noise(rng, height, width, 20, 4, 0.8, 1)
+    image += 18 * noise(rng, height, width, 40, 2, 0.6, 3)
+    for _ in range(max(3, height * width // 1500)):
         centre = int(rng.integers(0, width)), int(rng.integers(0, height))
         cv2.circle(image, centre, int(rng.integers(3, 9)), _colour(rng, 10, 240, 50).tolist(), -1,
                    cv2.LINE_AA)
     return _soften(image.astype(np.float32))
 
 
-def paint_box(paint: object, rng: np.random.Generator, sizes: list[tuple[int, int]]) -> list[Image]:
+def paint_box(paint: Callable[[np.random.Generator, int, int], Image], rng: np.random.Generator,
+              sizes: list[tuple[int, int]]) -> list[Image]:
     """Six faces (height, width) painted by `paint`, each a little brighter or darker."""
-    assert callable(paint)
     shades = (0.86, 0.94, 1.08, 0.7, 1.0, 0.9)
     return [paint(rng, h, w) * shade for (h, w), shade in zip(sizes, shades, strict=True)]
 

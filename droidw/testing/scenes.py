@@ -25,12 +25,27 @@ from droidw.testing._shapes import TEXEL, Body, Hits, cast, face_size
 if TYPE_CHECKING:
     from droidw.geometry.camera import Camera
 
-__all__ = ["MOTIONS", "Correspondences", "Scene", "SceneFrame", "SceneSpec"]
+__all__ = [
+    "MOTIONS",
+    "SCENES",
+    "Correspondences",
+    "Scene",
+    "SceneFrame",
+    "SceneSpec",
+    "named_spec",
+]
 
 Floats = npt.NDArray[np.float64]
 
 MOTIONS = tuple(CAMERA_PATHS)
 """Camera paths: handheld, orbit, forward, rotation (about the centre), static."""
+
+SCENES: dict[str, tuple[str, bool]] = {
+    **{motion: (motion, True) for motion in MOTIONS},
+    "no-moving": ("handheld", False),
+    **{f"{motion}-no-moving": (motion, False) for motion in MOTIONS},
+}
+"""Scenes by name: the camera path, and whether objects move."""
 
 _FLOOR, _CEILING = 1.2, -1.6
 
@@ -71,6 +86,19 @@ class SceneSpec:
                 "scene: frames >= 1, fps > 0, seed >= 0, noise >= 0 and focal > 0 are needed, got "
                 f"frames={self.frames}, fps={self.fps}, seed={self.seed}, noise={self.noise}, "
                 f"focal={self.focal}")
+
+
+def named_spec(name: str, *, width: int = 320, height: int = 240, frames: int = 60,
+               fps: float = 30.0, seed: int = 0, noise: float = 1.5) -> SceneSpec:
+    """The spec of a scene in `SCENES`, such as "handheld" or "orbit-no-moving".
+
+    Raises:
+        UsageError: there is no such scene, or a number is impossible.
+    """
+    if name not in SCENES:
+        raise UsageError(f"there is no synthetic scene '{name}'", "available: " + ", ".join(SCENES))
+    motion, moving = SCENES[name]
+    return SceneSpec(width, height, frames, fps, seed, moving, motion, noise)
 
 
 @dataclass(frozen=True)
@@ -160,8 +188,13 @@ class Scene:
         """Seconds since the first frame."""
         return index / self.spec.fps
 
-    def T_wc(self, index: int) -> Floats:  # noqa: N802 - the frame is in the name
-        """Camera to world [7] of a frame: translation, then unit quaternion xyzw."""
+    def T_wc(self, index: int) -> Floats:
+        """Camera to world [7] of a frame: translation, then unit quaternion xyzw.
+
+        Raises:
+            UsageError: there is no such frame.
+        """
+        self._check(index)
         pose = self._camera_pose(index)
         return np.concatenate([pose.t, quaternion(pose.R)])
 
@@ -313,8 +346,8 @@ def _furnish(rng: np.random.Generator, moving: bool) -> tuple[list[Body], list[P
                                        (0.3, 2.5, 0.7, 0.45, 0.5), (-0.7, 3.1, 0.5, 1.3, 0.4),
                                        (-2.1, 0.9, 0.5, 1.2, 0.5), (2.0, 1.3, 0.6, 0.7, 0.6)):
         tall = vary(height, 0.1)
-        add("box", (vary(width, 0.1), tall, depth), (vary(x, 0.15), _FLOOR - tall / 2, vary(z, 0.1)),
-            vary(0.0, 0.5))
+        wide, left, back = vary(width, 0.1), vary(x, 0.15), vary(z, 0.1)
+        add("box", (wide, tall, depth), (left, _FLOOR - tall / 2, back), vary(0.0, 0.5))
     add("box", (0.3, 0.3, 0.3), (vary(0.9, 0.2), vary(-0.9, 0.15), vary(2.3, 0.3)), vary(0.4, 0.4))
     if moving:
         add("box", (0.52, 1.5, 0.36), (0.0, 0.0, 1.0), actor=1)
