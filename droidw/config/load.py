@@ -1,0 +1,331 @@
+"""Configuration files and overrides merged into one tree that remembers where each key is from.
+
+Layers, each beating the ones before: schema defaults, the preset, what a file `extends`, the
+file, the command line. Names of plugins are only resolved later (`droidw.config.resolve`).
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from droidw.config.schema import DroidwConfig
+from droidw.errors import ConfigError, UsageError
+from droidw.plugin.registry import SLOTS, nearest
+
+__all__ = ["LISTED", "LoadedConfig", "Source", "load_config", "packaged_configs"]
+
+LISTED = ("exporters", "observers")
+"""Keys that map names of plugins to their options, any number at a time."""
+
+_COMMAND_LINE = "command line"
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)")
+_Tree = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a value was written: a file and its line (0: unknown), or the command line."""
+
+    file: str
+    line: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}" if self.line else self.file
+
+
+@dataclass(frozen=True)
+class LoadedConfig:
+    """Merged layers, not yet checked.
+
+    Attributes:
+        data: the tree, with every default in it; slots are `{name, options}`.
+        sources: full key -> where it was set; keys at their default are absent.
+        files: every file read, in the order of merging.
+        preset: name of the preset, or None.
+    """
+
+    data: _Tree
+    sources: Mapping[str, Source] = field(default_factory=dict)
+    files: tuple[str, ...] = ()
+    preset: str | None = None
+
+    def source(self, key: str) -> Source | None:
+        """Where a key, or else the nearest section around it, was set."""
+        while key:
+            if key in self.sources:
+                return self.sources[key]
+            key = key.rpartition(".")[0]
+        return None
+
+    def at(self, key: str) -> str:
+        """The start of a message about a key: "my.yaml:3: camera.fov"."""
+        source = self.source(key)
+        return key if source is None else f"{source}: {key}"
+
+
+def load_config(
+    files: Sequence[str | Path] = (),
+    preset: str | None = None,
+    overrides: Sequence[str] = (),
+    values: Mapping[str, Any] | None = None,
+) -> LoadedConfig:
+    """Read and merge, without looking at any plugin.
+
+    Args:
+        files: YAML files, later ones beat earlier ones.
+        preset: name of a packaged preset, or the path of a file used as one.
+        overrides: `key=value` as typed, the value read as YAML. Choices of a plugin take effect
+            before the options in the same list, in whatever order they were typed.
+        values: full key -> value, as flags such as `--stride` give them.
+    Raises:
+        ConfigError: a file is missing, is no YAML, extends itself, or a slot holds no name.
+        UsageError: an override is not `key=value`, or there is no such preset.
+    """
+    merger = _Merger()
+    if preset is not None:
+        merger.add_file(_preset_path(preset), ())
+    for file in files:
+        merger.add_file(Path(file), ())
+    source = Source(_COMMAND_LINE)
+    layers = [_nested(key.split("."), value) for key, value in (values or {}).items()]
+    layers += [_nested(*_override(text)) for text in overrides]
+    for layer in sorted(layers, key=lambda tree: not _chooses(tree)):
+        merger.merge(merger.data, layer, "", {"": source})
+    return LoadedConfig(merger.data, merger.sources, tuple(merger.files), preset)
+
+
+def packaged_configs() -> dict[str, Path]:
+    """Files that come with droidw, by the name that `extends` takes: "base", "presets/cpu".
+
+    Raises:
+        ConfigError: droidw is not installed, so they cannot be found.
+    """
+    try:
+        root = Path(str(resources.files("droidw.configs")))
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            "droidw runs from a bare source tree, so its presets are not found",
+            "install it: pip install -e .",
+        ) from error
+    return {
+        path.relative_to(root).with_suffix("").as_posix(): path
+        for path in sorted(root.rglob("*.yaml"))
+    }
+
+
+class _Merger:
+    """The tree under construction, with the source of each key."""
+
+    def __init__(self) -> None:
+        self.data: _Tree = dataclasses.asdict(DroidwConfig())
+        self.sources: dict[str, Source] = {}
+        self.files: list[str] = []
+
+    def add_file(self, path: Path, stack: tuple[Path, ...]) -> None:
+        """Merge what a file extends, then the file."""
+        real = path.resolve()
+        if real in stack:
+            chain = " -> ".join(p.name for p in (*stack[stack.index(real) :], real))
+            raise ConfigError(f"{_shown(path)}: extends: the files extend each other: {chain}")
+        tree, lines = _read(path)
+        extends = tree.pop("extends", [])
+        names = [extends] if isinstance(extends, str) else extends
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ConfigError(
+                f"{lines['extends']}: extends: {extends!r} is neither a name nor a list of names",
+                "example: extends: [presets/cpu, datasets/bonn]",
+            )
+        for name in names:
+            self.add_file(_extended(name, path, lines["extends"]), (*stack, real))
+        self.files.append(_shown(path))
+        self.merge(self.data, tree, "", {"": Source(_shown(path)), **lines})
+
+    def merge(
+        self, base: _Tree, layer: Mapping[str, Any], prefix: str, lines: Mapping[str, Source]
+    ) -> None:
+        """Merge a layer into the part of the tree below `prefix`."""
+        for key, value in layer.items():
+            full = f"{prefix}.{key}" if prefix else key
+            if full in SLOTS:
+                self._merge_slot(full, value, lines)
+            elif full in LISTED and isinstance(value, list):
+                self._replace(base, key, {str(name): {} for name in value}, full, lines)
+            elif isinstance(value, Mapping) and isinstance(base.get(key), dict):
+                self.merge(base[key], value, full, lines)
+            elif value is None and isinstance(base.get(key), dict) and prefix not in LISTED:
+                continue  # a section whose keys are all commented out
+            else:
+                self._replace(base, key, value, full, lines)
+
+    def _replace(
+        self, base: _Tree, key: str, value: Any, full: str, lines: Mapping[str, Source]
+    ) -> None:
+        self._forget(full)
+        base[key] = copy.deepcopy(value)
+        self.sources[full] = lines.get(full, lines[""])
+        for below, source in lines.items():
+            if below.startswith(full + "."):
+                self.sources[below] = source
+
+    def _merge_slot(self, slot: str, value: Any, lines: Mapping[str, Source]) -> None:
+        """`uncertainty: mlp` is `{name: mlp}`; another name than before drops the options."""
+        where = lines.get(slot, lines[""])
+        value = {"name": value} if isinstance(value, str) else value
+        if not isinstance(value, Mapping):
+            raise ConfigError(
+                f"{where}: {slot}: {_yaml(value)} is not the name of a plugin",
+                f"write {slot}: NAME, or {slot}: {{name: NAME, options: {{...}}}}; "
+                "what is to be off is called none\n"
+                f"see: droidw list-plugins --kind {slot}",
+            )
+        given = dict(value)
+        current: _Tree = self.data[slot]
+        if "name" in given:
+            name = given.pop("name")
+            name_source = lines.get(f"{slot}.name", where)
+            if not isinstance(name, str):
+                raise ConfigError(
+                    f"{name_source}: {slot}.name: {_yaml(name)} is not the name of a plugin",
+                    f"see: droidw list-plugins --kind {slot}",
+                )
+            if name != current["name"]:
+                self._forget(slot)
+                current = self.data[slot] = {"name": name, "options": {}}
+            self.sources[f"{slot}.name"] = name_source
+        self.merge(current, given, slot, lines)
+
+    def _forget(self, full: str) -> None:
+        for key in [k for k in self.sources if k == full or k.startswith(full + ".")]:
+            del self.sources[key]
+
+
+def _chooses(layer: _Tree) -> bool:
+    """Whether an override names a plugin, and so must come before that plugin's options."""
+    slot, value = next(iter(layer.items()))
+    return slot in SLOTS and (not isinstance(value, dict) or "name" in value)
+
+
+def _override(text: str) -> tuple[list[str], Any]:
+    key, equals, value = text.partition("=")
+    path = key.strip().split(".")
+    if not equals or not all(path):
+        raise UsageError(
+            f"{_COMMAND_LINE}: '{text}' is not key=value",
+            "example: camera.long_side=512   or   uncertainty=none",
+        )
+    try:
+        node = yaml.compose(value, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        raise UsageError(
+            f"{_COMMAND_LINE}: {key}: the value {value!r} is not YAML: "
+            + " ".join(str(error).split()),
+            "quote it for the shell and for YAML, for example: 'input.source=\"a: b\"'",
+        ) from error
+    return path, None if node is None else _Builder(_COMMAND_LINE).value(node, "")
+
+
+def _nested(path: Sequence[str], value: Any) -> _Tree:
+    for key in reversed(path):
+        value = {key: value}
+    return dict(value)
+
+
+def _preset_path(preset: str) -> Path:
+    if preset.endswith((".yaml", ".yml")):
+        return Path(preset)
+    packaged = packaged_configs()
+    if f"presets/{preset}" in packaged:
+        return packaged[f"presets/{preset}"]
+    names = [name.partition("/")[2] for name in packaged if name.startswith("presets/")]
+    near = nearest(preset, names)
+    raise UsageError(
+        f"--preset: no preset is called '{preset}'",
+        (f"did you mean '{near}'?   " if near else "") + f"presets: {', '.join(names)}, auto",
+    )
+
+
+def _extended(name: str, file: Path, where: Source) -> Path:
+    """The file that `extends` means: packaged by its name, or relative to the file."""
+    packaged = packaged_configs()
+    beside = file.parent / name
+    if name in packaged and not beside.is_file():
+        return packaged[name]
+    for candidate in (beside, beside.with_name(beside.name + ".yaml")):
+        if candidate.is_file():
+            return candidate
+    near = nearest(name, packaged)
+    raise ConfigError(
+        f"{where}: extends: there is no file or packaged config '{name}'",
+        (f"did you mean '{near}'?   " if near else "")
+        + f"packaged: {', '.join(packaged)}\nor a path relative to {file.parent or '.'}",
+    )
+
+
+def _shown(path: Path) -> str:
+    """A path as short as it can be told: relative to where the user stands."""
+    try:
+        return str(path.resolve().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def _read(path: Path) -> tuple[_Tree, dict[str, Source]]:
+    shown = _shown(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise ConfigError(f"{shown}: there is no such configuration file") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{shown}: cannot be read: {error}") from error
+    try:
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{shown}: is not YAML: " + " ".join(str(error).split())) from error
+    if node is None:
+        return {}, {}
+    if not isinstance(node, yaml.MappingNode):
+        raise ConfigError(f"{shown}: a configuration holds `key: value` lines, not a bare value")
+    builder = _Builder(shown)
+    return builder.value(node, ""), builder.lines
+
+
+class _Builder:
+    """Plain values out of YAML nodes, noting the line of every key; doubled keys are refused."""
+
+    def __init__(self, shown: str) -> None:
+        self.shown = shown
+        self.lines: dict[str, Source] = {}
+        self._loader = yaml.SafeLoader("")
+
+    def value(self, node: yaml.Node, prefix: str) -> Any:
+        if not isinstance(node, yaml.MappingNode):
+            value = self._loader.construct_object(node, deep=True)  # type: ignore[no-untyped-call]
+            # YAML 1.1 takes 1e-3 for text
+            plain = isinstance(node, yaml.ScalarNode) and not node.style
+            if plain and isinstance(value, str) and _NUMBER.fullmatch(value):
+                return float(value)
+            return value
+        tree: _Tree = {}
+        for key_node, value_node in node.value:
+            key = str(key_node.value)
+            full = f"{prefix}.{key}" if prefix else key
+            source = Source(self.shown, key_node.start_mark.line + 1)
+            if key in tree:
+                raise ConfigError(f"{source}: {full}: is written twice in this file")
+            self.lines[full] = source
+            tree[key] = self.value(value_node, full)
+        return tree
+
+
+def _yaml(value: Any) -> str:
+    """A value as it would stand in a YAML file."""
+    return str(yaml.safe_dump(value, default_flow_style=True)).removesuffix("...\n").strip()

@@ -1,0 +1,257 @@
+"""Names become components, options become dataclasses; whatever does not fit is refused here.
+
+Nothing heavy is loaded: a configuration is accepted or refused before any model exists.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import Any
+
+import yaml
+
+from droidw.config.check import check_keys, check_ranges, typed
+from droidw.config.load import LISTED, LoadedConfig, Source, load_config
+from droidw.config.schema import DroidwConfig
+from droidw.errors import ConfigError, DroidwError
+from droidw.plugin.component import Component
+from droidw.plugin.manager import Plugins
+from droidw.plugin.registry import SLOTS, Entry, nearest
+
+__all__ = ["COMPAT", "ResolvedConfig", "choose_preset", "resolve"]
+
+COMPAT = ("droid-w",)
+"""Published behaviours that `compat` may ask for."""
+
+_ON_DEVICE = ("features", "depth", "uncertainty", "ba", "correspondence")
+
+Part = tuple[Component[Any], Any]
+
+
+@dataclass(frozen=True)
+class ResolvedConfig:
+    """A configuration that fits: typed values, and the component behind each name.
+
+    Attributes:
+        config: the whole configuration; slots hold their options in full.
+        parts: slot -> (component, options); without "reader" where it is `auto`.
+        exporters, observers: (component, options) of those switched on, in the order written.
+        devices: devices that every part can run on, of "cpu" and "cuda".
+        sources: full key -> where it was set; keys at their default are absent.
+        preset: name of the preset, or None.
+        origins: slot, `exporters.NAME` or `observers.NAME` -> where the part comes from.
+    """
+
+    config: DroidwConfig
+    parts: Mapping[str, Part]
+    exporters: Sequence[Part] = ()
+    observers: Sequence[Part] = ()
+    devices: frozenset[str] = frozenset({"cpu", "cuda"})
+    sources: Mapping[str, Source] = field(default_factory=dict)
+    preset: str | None = None
+    origins: Mapping[str, Entry] = field(default_factory=dict)
+
+    def to_yaml(self) -> str:
+        """A file that can be run again and resolves to the same configuration."""
+        lines = ["# Resolved configuration of a run; run it again with --config."]
+        if self.preset:
+            lines.append(f"# preset: {self.preset}")
+        lines += [
+            f"# {key}: {entry.component.name}, from {entry.origin}"
+            for key, entry in self.origins.items()
+        ]
+        body = yaml.safe_dump(_plain(self.config), sort_keys=False, allow_unicode=True)
+        return "\n".join(lines) + "\n" + str(body)
+
+
+def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
+    """Check a configuration and find its parts.
+
+    Raises:
+        ConfigError: a key, value or combination is refused.
+        PluginNotFound: a name has no plugin.
+        MissingRequirementError: a chosen part lacks a package, weights or a device.
+        PluginError: a chosen part comes from a broken plugin, or two plugins claim its name.
+    """
+    check_keys(DroidwConfig, loaded.data, "", loaded)
+    config = typed(DroidwConfig, loaded.data, "", loaded)
+    check_ranges(config, "", loaded)
+    _check_values(config, loaded)
+
+    parts: dict[str, Part] = {}
+    origins: dict[str, Entry] = {}
+    problems: list[DroidwError] = []
+    for slot in SLOTS:
+        chosen = getattr(config, slot)
+        if slot == "reader" and chosen.name == "auto":
+            if chosen.options:
+                raise ConfigError(
+                    f"{loaded.at('reader.options.' + next(iter(chosen.options)))}: `auto` has no options",
+                    "name the reader that they are for: reader=NAME",
+                )
+            continue
+        try:
+            part, origins[slot] = _part(plugins, slot, chosen.name, f"{slot}.name", loaded)
+        except DroidwError as error:
+            problems.append(error)
+            continue
+        options = _options(part, chosen.options, f"{slot}.options", loaded)
+        chosen.options = _plain(options)
+        parts[slot] = (part, options)
+    listed: dict[str, list[Part]] = {}
+    for section in LISTED:
+        listed[section] = []
+        for name, given in getattr(config, section).items():
+            if given is None:
+                continue
+            key = f"{section}.{name}"
+            if not isinstance(given, dict):
+                raise ConfigError(
+                    f"{loaded.at(key)}: {given!r} is neither a mapping of options nor null",
+                    f"{key}={{}} switches it on, {key}=null off",
+                )
+            try:
+                part, origins[key] = _part(plugins, section[:-1], name, key, loaded)
+            except DroidwError as error:
+                problems.append(error)
+                continue
+            options = _options(part, given, key, loaded)
+            getattr(config, section)[name] = _plain(options)
+            listed[section].append((part, options))
+    if problems:
+        raise _joined(problems)
+    devices = _check_fit(config, parts, loaded)
+    return ResolvedConfig(
+        config, parts, tuple(listed["exporters"]), tuple(listed["observers"]), devices,
+        loaded.sources, loaded.preset, origins,
+    )
+
+
+def choose_preset(plugins: Plugins) -> tuple[str, str]:
+    """What `--preset auto` means here: `paper` if all of its parts can run, else `cpu`.
+
+    Returns:
+        The name of the preset, and a sentence that says why.
+    """
+    data = load_config(preset="paper").data
+    missing = []
+    for slot in SLOTS:
+        name = data[slot]["name"]
+        if slot == "reader" and name == "auto":
+            continue
+        registry = plugins.registry(slot)
+        status = registry.status(name) if name in registry else "not installed"
+        if status != "ready":
+            missing.append(f"{slot} '{name}' ({status})")
+    if missing:
+        return "cpu", "preset cpu, since paper lacks " + ", ".join(missing)
+    return "paper", "preset paper, since all of its parts are ready"
+
+
+def _part(
+    plugins: Plugins, kind: str, name: str, key: str, loaded: LoadedConfig
+) -> tuple[Component[Any], Entry]:
+    """The component of that name, ready to use; errors say the key and where it was written."""
+    registry = plugins.registry(kind)
+    try:
+        return registry.require(name), registry.entry(name)
+    except DroidwError as error:
+        raise type(error)(f"{loaded.at(key)}: {error.message}", error.hint) from error
+
+
+def _options(
+    component: Component[Any], given: Mapping[str, Any], key: str, loaded: LoadedConfig
+) -> Any:
+    check_keys(component.options, given, key, loaded)
+    options = typed(component.options, given, key, loaded)
+    check_ranges(options, key, loaded)
+    return options
+
+
+def _joined(problems: Sequence[DroidwError]) -> DroidwError:
+    """One error for all parts that are missing: nobody wants to learn of them one by one."""
+    first, *others = problems
+    if not others:
+        return first
+    hint = first.hint + "".join(f"\nalso: {other.message}" for other in others)
+    return type(first)(first.message, hint)
+
+
+def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
+    """What types and ranges of single keys cannot say."""
+    size = config.camera.size
+    if size and (len(size) != 2 or min(size) < 16):
+        raise ConfigError(
+            f"{loaded.at('camera.size')}: {size} is not a working size",
+            "valid: [width, height], each at least 16, or [] to follow camera.long_side",
+        )
+    phases = list(DroidwConfig().schedule)
+    for phase in config.schedule:
+        if phase not in phases:
+            near = nearest(phase, phases)
+            raise ConfigError(
+                f"{loaded.at(f'schedule.{phase}')}: there is no such phase",
+                (f"did you mean 'schedule.{near}'?   " if near else "")
+                + f"phases: {', '.join(phases)}",
+            )
+    if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", config.device):
+        raise ConfigError(
+            f"{loaded.at('device')}: '{config.device}' is not a device",
+            "valid: auto, cpu, cuda, cuda:0, cuda:1, ...",
+        )
+    for name in config.compat:
+        if name not in COMPAT:
+            near = nearest(name, COMPAT)
+            raise ConfigError(
+                f"{loaded.at('compat')}: no published behaviour is called '{name}'",
+                (f"did you mean '{near}'?   " if near else "") + f"valid: {', '.join(COMPAT)}",
+            )
+
+
+def _check_fit(
+    config: DroidwConfig, parts: Mapping[str, Part], loaded: LoadedConfig
+) -> frozenset[str]:
+    """Whether the parts fit each other and the device; returns the devices they share."""
+    model, extractor = parts["uncertainty"][0], parts["features"][0]
+    if "features" in model.capabilities and "features" not in extractor.capabilities:
+        raise ConfigError(
+            f"{loaded.at('uncertainty.name')}: '{model.name}' needs features, and the feature "
+            f"extractor '{extractor.name}' gives none",
+            "choose another extractor (features=NAME), or run without uncertainty: "
+            "uncertainty=none",
+        )
+    devices = frozenset({"cpu", "cuda"})
+    wanted = config.device.partition(":")[0]
+    for slot in _ON_DEVICE:
+        part = parts[slot][0]
+        able = part.capabilities & {"cpu", "cuda"}
+        if wanted != "auto" and wanted not in able:
+            raise ConfigError(
+                f"{loaded.at('device')}: {slot} '{part.name}' does not run on {wanted}",
+                f"it runs on: {', '.join(sorted(able)) or 'no device that it names'}; "
+                f"choose another part ({slot}=NAME) or device",
+            )
+        if not devices & able:
+            others = ", ".join(f"{s} '{parts[s][0].name}'" for s in _ON_DEVICE if s != slot)
+            raise ConfigError(
+                f"{loaded.at(slot + '.name')}: '{part.name}' runs only on "
+                f"{', '.join(sorted(able)) or 'no device'}, where not all other parts do",
+                f"the others: {others}",
+            )
+        devices &= able
+    return devices
+
+
+def _plain(value: Any) -> Any:
+    """Dataclasses, tuples and paths as what YAML has."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, PurePath) else value
