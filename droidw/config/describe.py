@@ -48,7 +48,8 @@ def rows(cls: type, prefix: str = "") -> Iterator[Row]:
                 yield from rows(type(value), key)
             else:
                 noun = KINDS[entry.name].noun
-                yield Row(key, "plugin", value.name, "", f"the {noun}: a name, or name and options")
+                name = str(getattr(value, "name", ""))
+                yield Row(key, "plugin", name, "", f"the {noun}: a name, or name and options")
         elif isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):
             for name, item in value.items():
                 for row in rows(type(item), f"{key}.{name}"):
@@ -131,7 +132,7 @@ def base_yaml(cls: type = DroidwConfig) -> str:
         common = 0
         while common < min(len(sections), len(seen)) and sections[common] == seen[common]:
             common += 1
-        if common < len(sections) and common == 0 or not sections and seen:
+        if seen != sections and (not common or not sections):
             lines.append("")
         for depth in range(common, len(sections)):
             lines.append("  " * depth + sections[depth] + ":")

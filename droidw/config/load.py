@@ -308,7 +308,7 @@ class _Builder:
 
     def value(self, node: yaml.Node, prefix: str) -> Any:
         if not isinstance(node, yaml.MappingNode):
-            value = self._loader.construct_object(node, deep=True)  # type: ignore[no-untyped-call]
+            value = self._loader.construct_object(node, deep=True)
             # YAML 1.1 takes 1e-3 for text
             plain = isinstance(node, yaml.ScalarNode) and not node.style
             if plain and isinstance(value, str) and _NUMBER.fullmatch(value):

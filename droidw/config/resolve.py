@@ -89,8 +89,9 @@ def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
         chosen = getattr(config, slot)
         if slot == "reader" and chosen.name == "auto":
             if chosen.options:
+                key = f"reader.options.{next(iter(chosen.options))}"
                 raise ConfigError(
-                    f"{loaded.at('reader.options.' + next(iter(chosen.options)))}: `auto` has no options",
+                    f"{loaded.at(key)}: `auto` has no options",
                     "name the reader that they are for: reader=NAME",
                 )
             continue

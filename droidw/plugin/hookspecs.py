@@ -200,7 +200,7 @@ def droidw_dataset_readers() -> Iterable[Component[DatasetReader]]:
 
 @hookspec
 def droidw_exporters() -> Iterable[Component[Exporter]]:
-    """Offer exporters, switched on by a key under `exporters`.
+    r"""Offer exporters, switched on by a key under `exporters`.
 
     The factory returns a `droidw.interfaces.exporters.Exporter`: `export(result, folder)`
     writes there and returns the files. Check with
@@ -213,7 +213,7 @@ def droidw_exporters() -> Iterable[Component[Exporter]]:
             def export(self, result, folder):
                 path = Path(folder) / "centres.csv"
                 rows = (",".join(map(str, row)) for row in result.trajectory.centres)
-                path.write_text("x,y,z\\n" + "\\n".join(rows) + "\\n")
+                path.write_text("x,y,z\n" + "\n".join(rows) + "\n")
                 return [path]
 
         @droidw.hookimpl

@@ -317,11 +317,11 @@ def _problem(item: Any) -> str:
     """What is wrong with a component, or ""."""
     if not isinstance(item, Component):
         return f"yielded {_described(item)} where a droidw.Component is expected"
-    if not isinstance(item.name, str) or not _NAME.fullmatch(item.name):
+    if not _NAME.fullmatch(str(item.name)):
         return f"the name {item.name!r} is not lower-case kebab, such as 'my-part'"
     if not callable(item.factory):
         return f"'{item.name}': factory is {_described(item.factory)}, not callable"
-    if not isinstance(item.options, type) or not dataclasses.is_dataclass(item.options):
+    if not dataclasses.is_dataclass(item.options) or not callable(item.options):
         return f"'{item.name}': options is {_described(item.options)}, not a dataclass"
     for entry in dataclasses.fields(item.options):
         missing = dataclasses.MISSING
