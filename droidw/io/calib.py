@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from omegaconf import OmegaConf
+from yaml import YAMLError  # type: ignore[import-untyped, unused-ignore]
 
 from droidw.errors import InputError
 from droidw.geometry.camera import Camera
@@ -123,7 +124,8 @@ def _camera(width: int, height: int, numbers: list[float], where: str) -> Camera
             "fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]] in pixels",
         )
     model: Literal["opencv", "pinhole"] = "opencv" if len(numbers) > 4 else "pinhole"
-    return Camera(width, height, *numbers[:4], distortion=tuple(numbers[4:]), model=model)
+    fx, fy, cx, cy = numbers[:4]
+    return Camera(width, height, fx, fy, cx, cy, tuple(numbers[4:]), model)
 
 
 def _from_droid(path: Path, lines: _Lines, width: int, height: int) -> tuple[Camera, str]:
@@ -168,18 +170,14 @@ def _from_keys(path: Path, lines: _Lines, width: int, height: int) -> tuple[Came
         raise InputError(f"{path} is no calibration: {' '.join(missing)} not found", _VALID)
     w = _size(found["width"], f"{path}, line {at['width']}") if "width" in found else width
     h = _size(found["height"], f"{path}, line {at['height']}") if "height" in found else height
-    four = [found[key] for key in ("fx", "fy", "cx", "cy")]
+    fx, fy, cx, cy = (found[key] for key in ("fx", "fy", "cx", "cy"))
     where = f"{path}, lines {min(at.values())} to {max(at.values())}"
     if model == "fisheye":
-        return Camera(w, h, *four, distortion=tuple(distortion), model="fisheye"), where
-    return _camera(w, h, four + distortion, where), where
+        return Camera(w, h, fx, fy, cx, cy, tuple(distortion), "fisheye"), where
+    return _camera(w, h, [fx, fy, cx, cy, *distortion], where), where
 
 
 def _from_yaml(path: Path, text: str, width: int, height: int) -> tuple[Camera, str]:
-    # The YAML loader of OmegaConf raises errors of the yaml package, all of them ValueErrors
-    # in spirit but not in type; they are told apart by what they know: a place in the text.
-    from yaml import YAMLError  # type: ignore[import-untyped, unused-ignore]
-
     try:
         data = OmegaConf.to_container(OmegaConf.create(text))
     except YAMLError as error:

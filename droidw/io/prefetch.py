@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import TypeVar, cast
 
 T = TypeVar("T")
 
@@ -30,7 +30,7 @@ def prefetch(items: Iterable[T], ahead: int = 4) -> Generator[T, None, None]:
             if item is end:
                 return
             waiting.append(worker.submit(next, source, end))
-            yield item  # type: ignore[misc] - everything but `end` is a T
+            yield cast("T", item)
     finally:
         worker.shutdown(wait=True, cancel_futures=True)
         if isinstance(source, Generator):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
@@ -10,18 +11,18 @@ from droidw.errors import InputError
 from droidw.interfaces.datasets import Selection
 from droidw.io.calib import read_calibration
 from droidw.io.images import IMAGE_SUFFIXES, list_images
+from droidw.io.notes import Notes
 from droidw.io.tum import read_tum
 from droidw.slam.frame import Trajectory
 from droidw_plugins.datasets._layout import VIDEO_SUFFIXES, looks_like_tum
 from droidw_plugins.datasets._listing import (
     Entry,
     ListedSource,
-    Notes,
     keep_rising,
     read_listing,
 )
 
-__all__ = ["FolderReader", "read_truth"]
+__all__ = ["FolderReader", "existing_folder", "read_truth"]
 
 _SUBFOLDERS = ("rgb", "images")
 _EXPECTED = (
@@ -51,17 +52,15 @@ class FolderReader:
 
     def open(self, source: str, selection: Selection) -> ListedSource:
         """Open the folder; see `DatasetReader.open`."""
-        path = _existing(source)
+        path = existing_folder(source, _EXPECTED)
         problems: list[str] = []
         notes = Notes(problems)
         if (path / "rgb.txt").is_file():
-            entries, skipped = read_listing(path / "rgb.txt", notes)
-            rising = keep_rising(entries, notes)
-            skipped += len(entries) - len(rising)
+            entries = keep_rising(read_listing(path / "rgb.txt", notes), notes)
         else:
-            rising, skipped = self._unlisted(path, problems), 0
+            entries = self._unlisted(path, problems)
         notes.finish()
-        out = ListedSource(path.resolve().name, rising, selection, problems, skipped)
+        out = ListedSource(path.resolve().name, entries, selection, problems, notes.skipped)
         if (path / "camera.txt").is_file():
             out.camera, note = read_calibration(path / "camera.txt", *out.size)
             problems.extend([note] if note else [])
@@ -86,12 +85,17 @@ class FolderReader:
         return [(n, n / self._fps, file) for n, file in enumerate(files)]
 
 
-def _existing(source: str) -> Path:
+def existing_folder(source: str, expected: str) -> Path:
+    """The folder `source`; `expected` is the hint of the error.
+
+    Raises:
+        InputError: it is not there or no folder.
+    """
     path = Path(source)
     if not path.exists():
-        raise InputError(f"{source}: no such folder", _EXPECTED)
+        raise InputError(f"{source}: no such folder", expected)
     if not path.is_dir():
-        raise InputError(f"{source} is not a folder", _EXPECTED)
+        raise InputError(f"{source} is not a folder", expected)
     return path
 
 
@@ -112,7 +116,7 @@ def _times_in_names(files: list[Path]) -> list[float] | None:
         return None
     times = [float(file.stem) for file in files]
     rising = sorted(times)
-    gaps = [b - a for a, b in zip(rising[:-1], rising[1:], strict=True)]
+    gaps = [b - a for a, b in pairwise(rising)]
     return times if min(gaps) > 0 and 0.001 <= median(gaps) <= 2.0 else None
 
 

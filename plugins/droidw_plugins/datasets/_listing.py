@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from droidw.errors import InputError
 from droidw.io.files import read_text
 from droidw.io.images import read_image
+from droidw.io.notes import Notes
 from droidw.io.prefetch import prefetch
 from droidw.slam.frame import RawFrame, Trajectory
 
@@ -19,39 +20,13 @@ if TYPE_CHECKING:
     from droidw.geometry.camera import Camera
     from droidw.interfaces.datasets import Selection
 
-__all__ = ["Entry", "ListedSource", "Notes", "keep_rising", "read_listing"]
+__all__ = ["Entry", "ListedSource", "keep_rising", "read_listing"]
 
 Entry = tuple[int, float, Path]
-_SHOWN = 5
 _PROBES = 5
 
 
-class Notes:
-    """Collects sentences, the first few of a kind as they are and the rest as a count.
-
-    Args:
-        problems: the list that receives the sentences.
-    """
-
-    def __init__(self, problems: list[str]) -> None:
-        self._problems = problems
-        self._counts: Counter[str] = Counter()
-
-    def add(self, kind: str, sentence: str) -> None:
-        """Note one case of `kind` ("pictures that cannot be decoded")."""
-        self._counts[kind] += 1
-        if self._counts[kind] <= _SHOWN:
-            self._problems.append(sentence)
-
-    def finish(self) -> None:
-        """Say how many of each kind were not listed one by one."""
-        for kind, count in self._counts.items():
-            if count > _SHOWN:
-                self._problems.append(f"{count - _SHOWN} more {kind}")
-        self._counts.clear()
-
-
-def read_listing(path: Path, notes: Notes) -> tuple[list[Entry], int]:
+def read_listing(path: Path, notes: Notes) -> list[Entry]:
     """Read `timestamp filename` lines; comments start with #.
 
     Lines without a usable time or name are noted and count as skipped pictures.
@@ -60,8 +35,7 @@ def read_listing(path: Path, notes: Notes) -> tuple[list[Entry], int]:
         path: the list; names in it are relative to its folder.
         notes: receives a sentence per bad line.
     Returns:
-        Entries with the position among all lines that are not comments, and how many were
-        skipped.
+        Entries with the position among all lines that are not comments.
     Raises:
         InputError: the file cannot be read or has no usable line.
     """
@@ -82,9 +56,7 @@ def read_listing(path: Path, notes: Notes) -> tuple[list[Entry], int]:
         if not fault and len(fields) < 2:
             fault = "no file name after the time"
         if fault:
-            notes.add(
-                f"bad lines in {path.name}", f"{path.name}, line {number}: {fault}, skipped"
-            )
+            notes.skip(f"bad lines in {path.name}", f"{path.name}, line {number}: {fault}")
         else:
             entries.append((position, time, path.parent / fields[1].strip()))
         position += 1
@@ -92,7 +64,7 @@ def read_listing(path: Path, notes: Notes) -> tuple[list[Entry], int]:
         raise InputError(
             f"{path} names no picture", "lines look like `1.033333 rgb/000031.jpg`"
         )
-    return entries, position - len(entries)
+    return entries
 
 
 def keep_rising(entries: Sequence[Entry], notes: Notes) -> list[Entry]:
@@ -120,9 +92,9 @@ def keep_rising(entries: Sequence[Entry], notes: Notes) -> list[Entry]:
         i = before[i]
     for i, (_, time, path) in enumerate(entries):
         if i not in kept:
-            notes.add(
+            notes.skip(
                 "pictures with a time that repeats or runs backwards",
-                f"{path.name}: its time {time!r} s repeats or runs backwards, skipped",
+                f"{path.name}: its time {time!r} s repeats or runs backwards",
             )
     return [entry for i, entry in enumerate(entries) if i in kept]
 
@@ -202,8 +174,8 @@ class ListedSource:
         return prefetch(self._decode())
 
     def _decode(self) -> Generator[RawFrame, None, None]:
-        counts, self._first_pass = self._first_pass, False
-        notes = Notes(self.problems if counts else [])
+        first, self._first_pass = self._first_pass, False
+        notes = Notes(self.problems if first else [])
         done = 0
         for index, time, path in self._entries:
             if self._limit and done == self._limit:
@@ -211,19 +183,17 @@ class ListedSource:
             try:
                 image = read_image(path)
             except InputError as error:
-                notes.add(
-                    "pictures that cannot be read", f"{path.name}: {error.message}, skipped"
-                )
-                self.skipped += counts
+                notes.skip("pictures that cannot be read", f"{path.name}: {error.message}")
+                self.skipped += first
                 continue
             height, width = image.shape[:2]
             if (width, height) != self.size:
-                notes.add(
+                notes.skip(
                     "pictures of another size",
-                    f"{path.name}: is {width}x{height} pixels where the others are "
-                    f"{self.size[0]}x{self.size[1]}, skipped",
+                    f"{path.name}: {width}x{height} pixels where the others have "
+                    f"{self.size[0]}x{self.size[1]}",
                 )
-                self.skipped += counts
+                self.skipped += first
                 continue
             done += 1
             yield RawFrame(index, time, image, path.name)
