@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 
-def opt(default: Any, help: str, **limits: Any) -> Any:  # noqa: A002 - the key's public name
+def opt(default: Any, help: str, **limits: Any) -> Any:
     """A dataclass field with help text and limits (`ge`, `gt`, `le`, `lt`)."""
     metadata = {"help": help, **limits}
     if isinstance(default, (list, dict)):
@@ -212,7 +212,9 @@ class DroidwConfig:
             "global": PhaseConfig(updates=0, learn=False, depth_prior=False),
             "fill": PhaseConfig(updates=0, learn=False, depth_prior=False),
         },
-        metadata={"help": "phases: init_blind, init, init_again, window, window_kept, global, fill"},
+        metadata={
+            "help": "phases: init_blind, init, init_again, window, window_kept, global, fill"
+        },
     )
     solver: SolverConfig = field(default_factory=SolverConfig)
     global_solver: SolverConfig = field(default_factory=lambda: SolverConfig(lm=1e-5, ep=1e-2))
