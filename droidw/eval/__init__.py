@@ -1,1 +1,1 @@
-"""Evaluation: reads files only, and states how each number was made."""
+"""Evaluation: files in, numbers out; nothing here knows of a running system."""

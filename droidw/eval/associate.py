@@ -1,0 +1,198 @@
+"""Which pose of one trajectory belongs to which pose of another, by time stamp."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from droidw.errors import InputError, UsageError
+
+__all__ = ["DEFAULT_MAX_DIFF", "Association", "associate"]
+
+DEFAULT_MAX_DIFF = 0.02
+"""Largest difference of two matched stamps in seconds, unless one asks for another."""
+
+
+@dataclass(frozen=True)
+class Association:
+    """Matched stamps of an estimate and a reference.
+
+    Attributes:
+        est: [M] int64, positions in the estimate, in time order.
+        ref: [M] int64, positions in the reference; no position occurs twice.
+        diff: [M] float64 seconds, stamp of the estimate (plus offset) minus that of the reference.
+        est_total, ref_total: how many stamps there were to match.
+        max_diff, offset: what was allowed and added, in seconds.
+    """
+
+    est: npt.NDArray[np.int64]
+    ref: npt.NDArray[np.int64]
+    diff: npt.NDArray[np.float64]
+    est_total: int
+    ref_total: int
+    max_diff: float
+    offset: float
+
+    def __len__(self) -> int:
+        return len(self.est)
+
+    def __str__(self) -> str:
+        worst = float(np.abs(self.diff).max()) if len(self) else 0.0
+        return (
+            f"{len(self):,} of {self.est_total:,} stamps matched with {self.ref_total:,} of the "
+            f"reference; largest difference {worst * 1e3:.1f} ms "
+            f"(allowed {self.max_diff * 1e3:g} ms)"
+        )
+
+
+def associate(
+    est: npt.NDArray[np.float64],
+    ref: npt.NDArray[np.float64],
+    max_diff: float = DEFAULT_MAX_DIFF,
+    offset: float = 0.0,
+    minimum: int = 1,
+) -> Association:
+    """Match stamps one to one, the closest pairs first.
+
+    A pair is taken when each is the nearest free partner of the other, and again among those left
+    over, until no two free stamps are within `max_diff`: the same pairs as taking all pairs in the
+    order of their difference.
+
+    Args:
+        est: [N] stamps of the estimate, seconds, in any order.
+        ref: [M] stamps of the reference, seconds, in any order.
+        max_diff: largest difference of a pair in seconds.
+        offset: seconds added to the stamps of the estimate first.
+        minimum: fewer pairs than this are refused.
+    Raises:
+        UsageError: if `max_diff` or `offset` is no sensible number.
+        InputError: if fewer than `minimum` pairs are found; the message says why it looks so.
+    """
+    if not (np.isfinite(max_diff) and max_diff >= 0):
+        raise UsageError(
+            f"the largest time difference must be a number of seconds from 0, not {max_diff}"
+        )
+    if not np.isfinite(offset):
+        raise UsageError(f"the time offset must be a finite number of seconds, not {offset}")
+    times_est = np.asarray(est, dtype=np.float64) + offset
+    times_ref = np.asarray(ref, dtype=np.float64)
+    if not (np.isfinite(times_est).all() and np.isfinite(times_ref).all()):
+        raise InputError("a time stamp is not a finite number")
+    pairs_est, pairs_ref = _mutual_nearest(times_est, times_ref, max_diff)
+    order = np.argsort(times_est[pairs_est], kind="stable")
+    pairs_est, pairs_ref = pairs_est[order], pairs_ref[order]
+    if len(pairs_est) < minimum:
+        raise _refusal(times_est, times_ref, len(pairs_est), minimum, max_diff)
+    return Association(
+        est=pairs_est,
+        ref=pairs_ref,
+        diff=times_est[pairs_est] - times_ref[pairs_ref],
+        est_total=len(times_est),
+        ref_total=len(times_ref),
+        max_diff=max_diff,
+        offset=offset,
+    )
+
+
+def _mutual_nearest(
+    est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64], max_diff: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    free_est = np.argsort(est, kind="stable")
+    free_ref = np.argsort(ref, kind="stable")
+    out_est: list[npt.NDArray[np.int64]] = []
+    out_ref: list[npt.NDArray[np.int64]] = []
+    while len(free_est) and len(free_ref):
+        to_ref = _nearest(est[free_est], ref[free_ref])
+        to_est = _nearest(ref[free_ref], est[free_est])
+        near = np.abs(est[free_est] - ref[free_ref][to_ref]) <= max_diff
+        mutual = near & (to_est[to_ref] == np.arange(len(free_est)))
+        if not near.any():
+            break
+        if not mutual.any():
+            # Ties can turn in a circle (equal stamps); the closest pair breaks it.
+            gap = np.where(near, np.abs(est[free_est] - ref[free_ref][to_ref]), np.inf)
+            mutual[int(np.argmin(gap))] = True
+        out_est.append(free_est[mutual])
+        out_ref.append(free_ref[to_ref[mutual]])
+        keep_ref = np.ones(len(free_ref), dtype=bool)
+        keep_ref[to_ref[mutual]] = False
+        # A stamp with no partner left within reach can never find one later.
+        free_est, free_ref = free_est[near & ~mutual], free_ref[keep_ref]
+    if not out_est:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    return np.concatenate(out_est), np.concatenate(out_ref)
+
+
+def _nearest(
+    values: npt.NDArray[np.float64], among: npt.NDArray[np.float64]
+) -> npt.NDArray[np.int64]:
+    """Position in the sorted `among` of the entry nearest to each value; the earlier on a tie."""
+    right = np.clip(np.searchsorted(among, values), 0, len(among) - 1)
+    left = np.maximum(right - 1, 0)
+    take_left = np.abs(values - among[left]) <= np.abs(values - among[right])
+    nearest = np.where(take_left, left, right)
+    # The first among equal stamps, so that both directions agree on one of them.
+    return np.searchsorted(among, among[nearest], side="left").astype(np.int64)
+
+
+def _refusal(
+    est: npt.NDArray[np.float64],
+    ref: npt.NDArray[np.float64],
+    found: int,
+    minimum: int,
+    max_diff: float,
+) -> InputError:
+    def span(times: npt.NDArray[np.float64]) -> str:
+        if not len(times):
+            return "no stamps"
+        return f"{len(times):,} stamps {times.min():.10g}-{times.max():.10g} s"
+
+    said = (
+        f"the time stamps do not match: {found} pairs within {max_diff:g} s, at least {minimum} "
+        f"are needed; ref {span(ref)}, est {span(est)}"
+    )
+    guess = _guess(est, ref)
+    return InputError(said + (f": {guess[0]}" if guess[0] else ""), guess[1])
+
+
+def _guess(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64]) -> tuple[str, str]:
+    """What the stamps look like, and what to do about it."""
+    if not len(est) or not len(ref):
+        return "", "give a trajectory with at least one pose a line: t tx ty tz qx qy qz qw"
+    for mine, other, word in ((est, ref, "estimate"), (ref, est, "reference")):
+        if _like_indices(mine) and not _like_indices(other):
+            return (
+                "these look like frame indices",
+                f"write the {word} with the seconds of its frames (the first column of rgb.txt)",
+            )
+    ratio = np.median(est) / np.median(ref) if np.median(ref) else 0.0
+    for factor, unit in ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")):
+        for value, word in ((ratio, "estimate"), (1 / ratio if ratio else 0.0, "reference")):
+            if 0.5 * factor < value < 2 * factor and np.abs(value - factor) < 0.5 * factor:
+                return (
+                    f"the {word} looks like {unit}",
+                    f"divide the first column of the {word} by {factor:.0e}",
+                )
+    gap = max(est.min() - ref.max(), ref.min() - est.max())
+    if gap > 0:
+        shift = ref.min() - est.min()
+        return (
+            f"they lie {gap:.6g} s apart",
+            "is it the reference of another sequence? if only the clocks differ: "
+            f"--t-offset {shift:.6f}",
+        )
+    nearest = float(np.abs(est - np.sort(ref)[_nearest(est, np.sort(ref))]).min())
+    return (
+        f"the nearest two are {nearest:.4g} s apart",
+        "if the clocks are that coarse: --t-max-diff SECONDS",
+    )
+
+
+def _like_indices(times: npt.NDArray[np.float64]) -> bool:
+    """Whole numbers that count up from near 0."""
+    if len(times) < 2:
+        return False
+    whole = bool((times == np.round(times)).all())
+    return whole and 0 <= float(times.min()) <= 1 and float(np.median(np.diff(times))) >= 1

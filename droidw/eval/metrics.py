@@ -1,0 +1,353 @@
+"""ATE and RPE of a trajectory against a reference; pure functions in float64."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from droidw.errors import InputError, UsageError
+from droidw.eval.associate import DEFAULT_MAX_DIFF, associate
+from droidw.geometry.align import umeyama
+from droidw.slam.frame import Trajectory
+
+__all__ = ["Align", "Delta", "Statistics", "TrajectoryScore", "path_length", "score"]
+
+Array = npt.NDArray[np.float64]
+Align = Literal["sim3", "se3", "scale", "none"]
+
+
+@dataclass(frozen=True)
+class Delta:
+    """How far apart the two poses of a relative error are: a count of frames, or seconds."""
+
+    value: float = 1.0
+    unit: Literal["frames", "seconds"] = "frames"
+
+    @classmethod
+    def parse(cls, text: str) -> Delta:
+        """Read "10" as ten frames and "0.5s" as half a second.
+
+        Raises:
+            UsageError: if the text is neither.
+        """
+        match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s?)\s*", text)
+        if match and float(match[1]) > 0:
+            if match[2]:
+                return cls(float(match[1]), "seconds")
+            if float(match[1]).is_integer():
+                return cls(float(match[1]), "frames")
+        raise UsageError(
+            f"--delta: '{text}' is neither a whole number of frames nor a number of seconds",
+            "for example --delta 10 (frames) or --delta 0.5s (seconds)",
+        )
+
+    def __str__(self) -> str:
+        if self.unit == "seconds":
+            return f"{self.value:g} s"
+        return f"{self.value:g} frame" + ("" if self.value == 1 else "s")
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Figures of a list of non-negative errors."""
+
+    rmse: float
+    mean: float
+    median: float
+    max: float
+    std: float
+
+    @classmethod
+    def of(cls, errors: Array) -> Statistics | None:
+        """Statistics of [M] errors, or None where there is none; std is that of the population."""
+        if not len(errors):
+            return None
+        return cls(
+            rmse=float(np.sqrt(np.mean(errors**2))),
+            mean=float(np.mean(errors)),
+            median=float(np.median(errors)),
+            max=float(np.max(errors)),
+            std=float(np.std(errors)),
+        )
+
+
+@dataclass(frozen=True)
+class TrajectoryScore:
+    """How far an estimated trajectory is from a reference, with all that the figures depend on.
+
+    Attributes:
+        estimate, reference: labels of what was compared, such as file names.
+        align: the alignment applied to the estimate first.
+        unit: unit of all lengths, that of the reference.
+        frames: usable poses of the estimate; matched: of these, with a pose of the reference.
+        ref_frames: usable poses of the reference.
+        skipped, ref_skipped: poses left out because a number in them was not finite.
+        max_diff: largest time difference of a matched pair that was allowed, seconds.
+        scale: factor that was applied to the estimate.
+        path_length: length of the reference over the matched frames.
+        path_length_est: the same of the estimate after alignment.
+        time_covered: share of the reference's duration that the matched frames span.
+        ate: absolute position errors.
+        rpe_trans, rpe_rot: relative errors over `delta`, in `unit` and in degrees; None where no
+            two matched frames are that far apart.
+        rpe_pairs: number of pairs behind them.
+        notes: sentences.
+        times, errors: [M] stamps in seconds and position errors of the matched frames.
+        aligned, truth: [M,3] camera centres, estimate after alignment and reference.
+    """
+
+    estimate: str
+    reference: str
+    align: Align
+    unit: str
+    frames: int
+    matched: int
+    ref_frames: int
+    skipped: int
+    ref_skipped: int
+    max_diff: float
+    scale: float
+    path_length: float
+    path_length_est: float
+    time_covered: float
+    ate: Statistics
+    delta: Delta
+    rpe_trans: Statistics | None
+    rpe_rot: Statistics | None
+    rpe_pairs: int
+    notes: tuple[str, ...]
+    times: Array = field(repr=False, compare=False)
+    errors: Array = field(repr=False, compare=False)
+    aligned: Array = field(repr=False, compare=False)
+    truth: Array = field(repr=False, compare=False)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the estimate's poses that could be compared."""
+        return self.matched / self.frames
+
+    @property
+    def ate_percent(self) -> float | None:
+        """RMSE of the position errors in percent of the path, or None if nothing moved."""
+        return 100.0 * self.ate.rmse / self.path_length if self.path_length > 0 else None
+
+    def to_dict(self) -> dict[str, Any]:
+        """A flat, JSON-able record: finite numbers, text, and None for what does not exist."""
+        record: dict[str, Any] = {
+            "estimate": self.estimate,
+            "reference": self.reference,
+            "align": self.align,
+            "unit": self.unit,
+            "frames": self.frames,
+            "matched": self.matched,
+            "coverage": self.coverage,
+            "time_covered": self.time_covered,
+            "ref_frames": self.ref_frames,
+            "skipped": self.skipped,
+            "ref_skipped": self.ref_skipped,
+            "max_diff": self.max_diff,
+            "scale": self.scale,
+            "path_length": self.path_length,
+            "path_length_est": self.path_length_est,
+            "ate_percent": self.ate_percent,
+            "rpe_delta": str(self.delta),
+            "rpe_pairs": self.rpe_pairs,
+            "notes": list(self.notes),
+        }
+        for name, stats in (
+            ("ate", self.ate),
+            ("rpe_trans", self.rpe_trans),
+            ("rpe_rot_deg", self.rpe_rot),
+        ):
+            for figure in ("rmse", "mean", "median", "max", "std"):
+                record[f"{name}_{figure}"] = None if stats is None else getattr(stats, figure)
+        return record
+
+
+def score(
+    estimate: Trajectory,
+    reference: Trajectory,
+    *,
+    align: Align = "sim3",
+    max_diff: float = DEFAULT_MAX_DIFF,
+    offset: float = 0.0,
+    delta: Delta | None = None,
+    unit: str = "m",
+    names: tuple[str, str] = ("estimate", "reference"),
+) -> TrajectoryScore:
+    """Compare an estimated trajectory with a reference (both camera to world).
+
+    The estimate is aligned to the reference over the matched camera centres by Umeyama's method
+    ("scale" applies its factor alone). ATE is the distance of matched centres. RPE compares the
+    motion between every two matched frames that lie `delta` apart: its translation after
+    alignment, and the angle between the two rotations, in degrees.
+
+    Raises:
+        UsageError: for an unknown alignment.
+        InputError: if stamps do not match or too few poses are usable.
+    """
+    if align not in get_args(Align):
+        raise UsageError(
+            f"'{align}' is no alignment", f"available: {', '.join(get_args(Align))}"
+        )
+    delta = delta or Delta()
+    notes: list[str] = []
+    est, skipped = _usable(estimate, names[0], notes)
+    ref, ref_skipped = _usable(reference, names[1], notes)
+    matches = associate(
+        est.times, ref.times, max_diff, offset, minimum=3 if align in ("sim3", "se3") else 2
+    )
+    poses, truth = est.T_wc[matches.est], ref.T_wc[matches.ref]
+    times = ref.times[matches.ref]
+    scale, R, t = _alignment(poses[:, :3], truth[:, :3], align, notes)
+    aligned = scale * poses[:, :3] @ R.T + t
+    errors = np.linalg.norm(aligned - truth[:, :3], axis=1)
+    first, second = _pairs(times, delta)
+    rpe_trans, rpe_rot = _relative_errors(poses, truth, scale, first, second)
+    if len(matches) < len(est):
+        notes.append(
+            f"{len(est) - len(matches)} of {len(est)} poses have no reference within "
+            f"{max_diff:g} s and are left out"
+        )
+    if not len(first):
+        notes.append(f"no two matched frames lie {delta} apart: there is no RPE")
+    duration = float(ref.times.max() - ref.times.min())
+    return TrajectoryScore(
+        estimate=names[0],
+        reference=names[1],
+        align=align,
+        unit=unit,
+        frames=len(est),
+        matched=len(matches),
+        ref_frames=len(ref),
+        skipped=skipped,
+        ref_skipped=ref_skipped,
+        max_diff=max_diff,
+        scale=scale,
+        path_length=path_length(truth[:, :3]),
+        path_length_est=path_length(aligned),
+        time_covered=float(times.max() - times.min()) / duration if duration > 0 else 1.0,
+        ate=_statistics(errors),
+        delta=delta,
+        rpe_trans=Statistics.of(rpe_trans),
+        rpe_rot=Statistics.of(rpe_rot),
+        rpe_pairs=len(first),
+        notes=tuple(notes),
+        times=times,
+        errors=errors,
+        aligned=aligned,
+        truth=truth[:, :3].copy(),
+    )
+
+
+def path_length(centres: Array) -> float:
+    """Sum of the distances between successive centres [N,3]."""
+    return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
+
+
+def _statistics(errors: Array) -> Statistics:
+    stats = Statistics.of(errors)
+    if stats is None:
+        raise InputError("there is no pose to compare")
+    return stats
+
+
+def _usable(
+    trajectory: Trajectory, name: str, notes: list[str]
+) -> tuple[Trajectory, int]:
+    """The finite poses in time order, quaternions normalised, and how many were left out."""
+    T_wc = np.asarray(trajectory.T_wc, dtype=np.float64).reshape(-1, 7)
+    times = np.asarray(trajectory.times, dtype=np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        length = np.linalg.norm(T_wc[:, 3:], axis=1)
+        good = np.isfinite(T_wc).all(axis=1) & np.isfinite(times) & (length > 1e-9)
+        good &= np.isfinite(length)
+    skipped = int((~good).sum())
+    if not good.any():
+        what = "holds no pose" if not len(times) else f"holds no finite pose in {len(times)} lines"
+        raise InputError(f"{name}: {what}", "expected a pose a line: t tx ty tz qx qy qz qw")
+    if skipped:
+        notes.append(f"{name}: {skipped} of {len(times)} poses are not finite and are left out")
+    times, T_wc = times[good], T_wc[good].copy()
+    T_wc[:, 3:] /= length[good, None]
+    order = np.argsort(times, kind="stable")
+    return Trajectory(times[order], T_wc[order]), skipped
+
+
+def _alignment(
+    est: Array, truth: Array, align: Align, notes: list[str]
+) -> tuple[float, Array, Array]:
+    """Scale, rotation and translation for the estimate; what is undetermined goes to the notes."""
+    if align == "none":
+        return 1.0, np.eye(3), np.zeros(3)
+    found = umeyama(est, truth, align != "se3")
+    if found.note:
+        notes.append(f"alignment: {found.note}")
+    if align == "scale":
+        return float(found.scale), np.eye(3), np.zeros(3)
+    scale = float(found.scale) if align == "sim3" else 1.0
+    return scale, np.asarray(found.R, dtype=np.float64), np.asarray(found.t, dtype=np.float64)
+
+
+def _pairs(
+    times: Array, delta: Delta
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Every frame and the one `delta` later; in seconds, the nearest within a tenth of it."""
+    count = len(times)
+    if delta.unit == "frames":
+        step = int(delta.value)
+        first = np.arange(max(count - step, 0), dtype=np.int64)
+        return first, first + step
+    goal = times + delta.value
+    right = np.clip(np.searchsorted(times, goal), 0, count - 1)
+    left = np.maximum(right - 1, 0)
+    nearest = np.where(goal - times[left] <= times[right] - goal, left, right)
+    first = np.arange(count, dtype=np.int64)
+    good = (np.abs(times[nearest] - goal) <= 0.1 * delta.value) & (nearest > first)
+    return first[good], nearest[good].astype(np.int64)
+
+
+def _relative_errors(
+    est: Array,
+    truth: Array,
+    scale: float,
+    first: npt.NDArray[np.int64],
+    second: npt.NDArray[np.int64],
+) -> tuple[Array, Array]:
+    R_est, R_ref = _rotations(est[:, 3:]), _rotations(truth[:, 3:])
+    # Motion seen from the first of the two cameras: R_1^T R_2 and R_1^T (c_2 - c_1).
+    turn_est = R_est[first].transpose(0, 2, 1) @ R_est[second]
+    turn_ref = R_ref[first].transpose(0, 2, 1) @ R_ref[second]
+    step_est = scale * _rotate_back(R_est[first], est[second, :3] - est[first, :3])
+    step_ref = _rotate_back(R_ref[first], truth[second, :3] - truth[first, :3])
+    error = turn_ref.transpose(0, 2, 1) @ turn_est
+    # atan2 of sine and cosine keeps its digits at small angles, where acos of the trace does not.
+    axis = np.stack(
+        [
+            error[:, 2, 1] - error[:, 1, 2],
+            error[:, 0, 2] - error[:, 2, 0],
+            error[:, 1, 0] - error[:, 0, 1],
+        ],
+        axis=1,
+    )
+    angle = np.arctan2(np.linalg.norm(axis, axis=1), np.trace(error, axis1=1, axis2=2) - 1.0)
+    return np.linalg.norm(step_est - step_ref, axis=1), np.degrees(angle)
+
+
+def _rotate_back(R: Array, vectors: Array) -> Array:
+    return np.asarray(np.einsum("nji,nj->ni", R, vectors))
+
+
+def _rotations(q: Array) -> Array:
+    """Rotation matrices [N,3,3] of unit quaternions xyzw [N,4]."""
+    x, y, z, w = q.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

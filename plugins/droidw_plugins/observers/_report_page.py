@@ -1,0 +1,380 @@
+"""The observer behind `report`, and the page that it writes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+
+from droidw.events import Event, RunFinished, RunWarning
+from droidw.io.files import atomic_write
+from droidw.slam.frame import RunResult
+from droidw_plugins.observers._cloud_view import cloud_views
+from droidw_plugins.observers._html import (
+    bars,
+    definitions,
+    escape,
+    page,
+    section,
+    tile,
+)
+from droidw_plugins.observers._pictures import colour_ramp, keyframe_pictures
+from droidw_plugins.observers._svg import Line, error_chart, nice_step, path_view
+from droidw_plugins.observers._truth import Paths, make_paths
+
+__all__ = ["Report", "build_page"]
+
+_KNOWN = {
+    "config.yaml": "the resolved configuration; droidw run takes it again",
+    "manifest.json": "versions, timings, weights, what was assumed",
+    "log.txt": "what the run said",
+    "trajectory.tum": "pose of every frame: t tx ty tz qx qy qz qw, camera to world",
+    "keyframes.tum": "poses of the keyframes, in the same format",
+    "points.ply": "static point cloud with colours",
+    "uncertainty": "what moves, frame by frame",
+    "depth": "depth maps of the keyframes",
+    "metrics.json": "errors against the truth",
+    "report.html": "this page",
+}
+
+
+class Report:
+    """Writes `report.html` into the run folder when a run has finished.
+
+    Args:
+        keyframes: keyframes shown at most.
+        cloud_points: points drawn in each view of the cloud at most.
+    """
+
+    def __init__(self, keyframes: int = 24, cloud_points: int = 400_000) -> None:
+        self._keyframes = keyframes
+        self._cloud_points = cloud_points
+        self._warnings: list[str] = []
+
+    def on_event(self, event: Event) -> None:
+        """Collect warnings; write the page at the end."""
+        if isinstance(event, RunWarning):
+            self._warnings.append(event.text)
+        elif isinstance(event, RunFinished):
+            text = build_page(
+                event.result,
+                event.run_dir,
+                event.metrics,
+                warnings=tuple(self._warnings),
+                keyframes=self._keyframes,
+                cloud_points=self._cloud_points,
+            )
+            with atomic_write(event.run_dir / "report.html") as stream:
+                stream.write(text.encode("utf-8"))
+
+
+def build_page(
+    result: RunResult,
+    run_dir: Path,
+    metrics: Mapping[str, Any] | None = None,
+    *,
+    warnings: tuple[str, ...] = (),
+    keyframes: int = 24,
+    cloud_points: int = 400_000,
+) -> str:
+    """The page as text: no scripts, nothing loaded from anywhere.
+
+    Args:
+        result: the finished run.
+        run_dir: its folder, for the list of files.
+        metrics: figures of `droidw eval`, or None where truth is unknown.
+        warnings: sentences heard during the run, beside those of the result.
+        keyframes: keyframes shown at most.
+        cloud_points: points drawn in each view of the cloud at most.
+    """
+    paths = make_paths(result)
+    name = Path(result.source).name or result.source or "run"
+    told = list(dict.fromkeys((*result.warnings, *warnings)))
+    parts = [
+        f'<header><p class="brand">droidw run report</p><h1>{escape(name)}</h1>'
+        f"<p>{escape(_subtitle(result, run_dir))}</p></header>",
+        _tiles(result, paths, metrics or {}),
+    ]
+    if told:
+        items = "".join(f"<li>{escape(text)}</li>" for text in told)
+        parts.append(section(f"Warnings ({len(told)})", f"<ul>{items}</ul>", css="warn"))
+    parts.append(_trajectory(paths))
+    parts.append(_cloud(result, cloud_points))
+    parts.append(_keyframes(result, keyframes))
+    parts.append(_timings(result.manifest))
+    parts.append(_camera(result))
+    if metrics:
+        parts.append(_metrics(metrics))
+    parts.append(_files(result.manifest, run_dir))
+    parts.append(_config(result.manifest))
+    parts.append(_versions(result.manifest))
+    parts.append("<footer>This page needs no network: everything on it is inside it.</footer>")
+    return page(f"{name} · droidw", "\n".join(part for part in parts if part))
+
+
+def _subtitle(result: RunResult, run_dir: Path) -> str:
+    parts = [result.source]
+    for key in ("preset", "device", "started"):
+        value = result.manifest.get(key)
+        if isinstance(value, str) and value:
+            parts.append(value)
+    return " · ".join(part for part in (*parts, str(run_dir)) if part)
+
+
+def _tiles(result: RunResult, paths: Paths, metrics: Mapping[str, Any]) -> str:
+    manifest = result.manifest
+    poses = len(paths.times)
+    frames = _number(manifest.get("frames"))
+    tiles = [
+        tile(f"{int(frames) if frames else len(result.trajectory):,}", "", "frames"),
+        tile(f"{poses:,}", "", "frames with a pose"),
+        tile(f"{len(result.keyframes):,}", "", "keyframes"),
+    ]
+    fps, memory = _number(manifest.get("fps")), _number(manifest.get("peak_memory_mb"))
+    if fps is not None:
+        tiles.append(tile(f"{fps:.1f}", "frames/s", "whole run"))
+    if memory is not None:
+        tiles.append(tile(f"{memory:,.0f}", "MB", "peak memory"))
+    if paths.unit or paths.depth is None:
+        tiles.append(tile(f"{paths.length:.3g}", paths.unit or "units", "path length"))
+    else:
+        tiles.append(tile(f"{paths.length / paths.depth:.3g}", "x depth", "path length",
+                          "in median scene depths"))
+    ate = _number(metrics.get("ate_rmse"))
+    unit = str(metrics.get("unit", paths.unit or "m"))
+    if ate is None and len(paths.errors):
+        ate = float(np.sqrt(np.mean(paths.errors**2)))
+    if ate is not None:
+        percent = _number(metrics.get("ate_percent"))
+        how = str(metrics.get("align", "sim3"))
+        more = f"after {how}" + (f", {percent:.1f} % of the path" if percent is not None else "")
+        tiles.append(tile(f"{ate:.3g}", unit, "ATE RMSE", more))
+    masks = metrics.get("masks")
+    if isinstance(masks, Mapping) and _number(masks.get("auc")) is not None:
+        tiles.append(tile(f"{masks['auc']:.3f}", "", "motion mask AUC"))
+    return f'<div class="tiles">{"".join(tiles)}</div>'
+
+
+def _trajectory(paths: Paths) -> str:
+    if not len(paths.centres):
+        return section("Trajectory", '<p class="hint">There is no pose to show.</p>')
+    span = float(np.ptp(paths.centres, axis=0).max())
+    least = 0.02 * paths.depth if paths.depth else 0.0
+    length = nice_step(max(span, least, 1e-9), 3)
+    label = f"{length:g} {paths.unit or 'units'}"
+    if not paths.unit:
+        label += ", scale arbitrary"
+        if paths.depth:
+            label += f" ({100 * length / paths.depth:.2g} % of the median depth)"
+    views = []
+    for title, axes, up, names in (
+        ("from above", (0, 2), 1.0, ("right", "forward")),
+        ("from the side", (2, 1), -1.0, ("forward", "up")),
+    ):
+        flip = np.array([1.0, up])
+        lines = []
+        if paths.truth is not None:
+            lines.append(Line(paths.truth[:, axes] * flip, "truth"))
+        lines.append(Line(paths.centres[:, axes] * flip, "est"))
+        drawn = path_view(
+            f"trajectory {title}", names, lines, paths.keyframes[:, axes] * flip,
+            (length, label), least_span=least,
+        )
+        views.append(f"<figure>{drawn}<figcaption>{escape(title.capitalize())}</figcaption></figure>")
+    legend = [
+        _sample('<path class="est" d="M1 6H25"/>', "estimate"),
+        _sample('<circle class="key" cx="13" cy="6" r="3"/>', "keyframe"),
+        _sample('<circle class="start" cx="13" cy="6" r="5"/>', "start"),
+        _sample('<rect class="end" x="8.5" y="1.5" width="9" height="9"/>', "end"),
+    ]
+    if paths.truth is not None:
+        legend.insert(1, _sample('<path class="truth" d="M2 6H25"/>', "truth"))
+    body = f'<div class="legend">{"".join(legend)}</div><div class="pair">{"".join(views)}</div>'
+    if len(paths.errors) > 1:
+        rmse = float(np.sqrt(np.mean(paths.errors**2)))
+        chart = error_chart(
+            paths.error_times, paths.errors, rmse, paths.keyframe_times, paths.unit
+        )
+        body += f'<figure style="margin-top:16px">{chart}<figcaption>Position error over time, ' \
+            "in seconds from the first frame; ticks mark keyframes</figcaption></figure>"
+    hint = "Seen in the frame of the first camera, both axes to one scale."
+    if paths.truth is not None:
+        hint += " The truth is laid on the estimate by the best similarity (Sim(3))."
+    elif paths.note:
+        hint += f" {paths.note[0].upper()}{paths.note[1:]}."
+    else:
+        hint += " No truth is known: the scale of a single camera is arbitrary."
+    return section("Trajectory", body, hint)
+
+
+def _sample(shape: str, label: str) -> str:
+    return f'<span><svg viewBox="0 0 26 12">{shape}</svg>{escape(label)}</span>'
+
+
+def _cloud(result: RunResult, most: int) -> str:
+    views = cloud_views(result, most)
+    if not views:
+        return section("Static point cloud", '<p class="hint">The cloud is empty.</p>')
+    figures = "".join(
+        f'<figure><img src="{uri}" width="{width}" height="{height}" '
+        f'alt="point cloud {escape(name)}"><figcaption>{escape(name.capitalize())}</figcaption>'
+        "</figure>"
+        for name, uri, width, height in views
+    )
+    return section(
+        "Static point cloud",
+        f'<div class="pair cloud">{figures}</div>',
+        f"{len(result.cloud.xyz):,} points that several keyframes agree on and that did not move; "
+        "the line is the path of the camera.",
+    )
+
+
+def _keyframes(result: RunResult, most: int) -> str:
+    total = len(result.keyframes)
+    pictures = keyframe_pictures(result.keyframes, result.stride, result.offset, most)
+    if not pictures:
+        return section("Keyframes", '<p class="hint">There is no keyframe to show.</p>')
+    cards = []
+    for shown in pictures:
+        record = shown.record
+        size = f'width="{shown.width}" height="{shown.height}"'
+        cards.append(
+            f'<figure><div><img src="{shown.overlay}" {size} alt="keyframe {shown.number} with '
+            f'uncertainty"><img src="{shown.depth}" {size} alt="depth of keyframe '
+            f'{shown.number}"></div><figcaption>#{shown.number} · frame {record.index} · '
+            f"{record.time:.2f} s · {100 * shown.moving:.0f} % down-weighted · "
+            f"depth {100 * shown.depth_share:.0f} %</figcaption></figure>"
+        )
+    legend = (
+        '<div class="legend"><span>uncertain <i class="ramp" style="background:'
+        f'{colour_ramp("uncertainty")}"></i> more</span><span>far <i class="ramp" '
+        f'style="background:{colour_ramp("depth")}"></i> near</span>'
+        "<span>grey: depth not confirmed by other keyframes</span></div>"
+    )
+    some = f"{len(pictures)} of {total}, evenly chosen. " if len(pictures) < total else ""
+    return section(
+        "Keyframes",
+        f'{legend}<div class="keys">{"".join(cards)}</div>',
+        f"{some}Left the picture, tinted where uncertainty took its weight away (it moves, or it "
+        "does not fit); right the inverse depth. Colours mean the same in all of them.",
+    )
+
+
+def _timings(manifest: Mapping[str, Any]) -> str:
+    stages = manifest.get("stages")
+    rows = [
+        (str(name), seconds)
+        for name, value in (stages.items() if isinstance(stages, Mapping) else ())
+        if (seconds := _number(value)) is not None and seconds >= 0
+    ]
+    if not rows:
+        return ""
+    total = sum(seconds for _, seconds in rows)
+    return section("Time", bars(rows, "s"), f"{total:.2f} s in all stages together.")
+
+
+def _camera(result: RunResult) -> str:
+    camera = result.camera
+    said = manifest_text(result.manifest.get("camera"))
+    rows: list[tuple[str, object]] = [
+        ("working size", f"{camera.width} x {camera.height} px"),
+        ("focal length", f"{camera.fx:.2f}, {camera.fy:.2f} px"),
+        ("principal point", f"{camera.cx:.2f}, {camera.cy:.2f} px"),
+        ("grid", f"a cell every {result.stride} px"),
+    ]
+    return section("Camera", definitions(rows), said)
+
+
+def manifest_text(value: object) -> str:
+    """A manifest entry as one line of text, "" for what is not there."""
+    if value is None:
+        return ""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key}: {entry}" for key, entry in value.items())
+    return str(value)
+
+
+def _metrics(metrics: Mapping[str, Any]) -> str:
+    rows: list[tuple[str, object]] = []
+
+    def add(prefix: str, record: Mapping[str, Any]) -> None:
+        for key, value in record.items():
+            if isinstance(value, Mapping):
+                add(f"{prefix}{key} ", value)
+            elif isinstance(value, bool) or value is None or isinstance(value, (list, tuple)):
+                continue
+            elif isinstance(value, float):
+                rows.append((f"{prefix}{key}", f"{value:.6g}"))
+            else:
+                rows.append((f"{prefix}{key}", value))
+
+    add("", metrics)
+    return (
+        f"<section><details><summary>All figures of the evaluation</summary>"
+        f'<div style="margin-top:12px">{definitions(rows)}</div></details></section>'
+    )
+
+
+def _files(manifest: Mapping[str, Any], run_dir: Path) -> str:
+    named = manifest.get("files")
+    meaning = {str(key): str(value) for key, value in named.items()} if isinstance(
+        named, Mapping) else {}
+    there = {
+        path.name for path in run_dir.iterdir() if not path.name.startswith(".")
+    } if run_dir.is_dir() else set()
+    there.add("report.html")
+    # An entry of the manifest may name a file inside a folder, such as depth/000000.png.
+    names = sorted(there | {name for name in meaning if (run_dir / name).exists()})
+    rows = []
+    for name in names:
+        path = run_dir / name
+        about = meaning.get(name) or meaning.get(f"{name}/") or _KNOWN.get(name, "")
+        link = quote(name) + ("/" if path.is_dir() else "")
+        rows.append(
+            f'<tr><td><a href="./{escape(link)}">{escape(name)}</a></td><td>{escape(about)}</td>'
+            f"<td>{'' if name == 'report.html' else escape(_size(path))}</td></tr>"
+        )
+    return section("Files", f"<table>{''.join(rows)}</table>", str(run_dir))
+
+
+def _size(path: Path) -> str:
+    try:
+        if path.is_dir():
+            count = sum(1 for _ in path.iterdir())
+            return f"{count} file" + ("" if count == 1 else "s")
+        size = float(path.stat().st_size)
+    except OSError:
+        return ""
+    for unit in ("B", "kB", "MB"):
+        if size < 1000:
+            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
+        size /= 1000
+    return f"{size:.1f} GB"
+
+
+def _config(manifest: Mapping[str, Any]) -> str:
+    text = manifest.get("config_yaml")
+    if not text:
+        return ""
+    return (
+        "<section><details><summary>Configuration</summary>"
+        f"<pre>{escape(text)}</pre></details></section>"
+    )
+
+
+def _versions(manifest: Mapping[str, Any]) -> str:
+    versions = manifest.get("versions")
+    if not isinstance(versions, Mapping) or not versions:
+        return ""
+    rows = [(str(key), manifest_text(value)) for key, value in versions.items()]
+    return section("Versions", definitions(rows))
+
+
+def _number(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    return float(value) if math.isfinite(value) else None
