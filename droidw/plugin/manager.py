@@ -7,22 +7,20 @@ isolation, provenance, the load and block lists, and checks of what the hooks re
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import logging
 import os
 import re
-import sys
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib import metadata, util
+from importlib import metadata
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pluggy
 
 from droidw.errors import PluginError, UsageError
 from droidw.plugin import hookspecs
+from droidw.plugin.checks import HOOKS, checked_components, explained, import_file, problem_of
 from droidw.plugin.component import Component
 from droidw.plugin.registry import KINDS, Entry, Failure, Registry, nearest
 
@@ -39,8 +37,6 @@ LOAD_VARIABLE = "DROIDW_LOAD_PLUGINS"
 DISABLE_VARIABLE = "DROIDW_DISABLE_PLUGINS"
 WEIGHTS_VARIABLE = "DROIDW_WEIGHTS"
 
-_NAME = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
-_HOOKS = {kind.hook: kind.name for kind in KINDS.values()}
 _log = logging.getLogger(__name__)
 
 
@@ -116,7 +112,7 @@ class Plugins:
         """
         self.registry(kind)
         origin = _Origin(getattr(component, "name", "?"), "registered from Python", "")
-        problem = _problem(component)
+        problem = problem_of(component)
         if problem:
             raise PluginError(f"a component of kind '{kind}' {problem}")
         self._entries.append(
@@ -167,7 +163,7 @@ class Plugins:
             raise UsageError(
                 f"--plugin {path}: there is no such file", "give the path of a Python file"
             )
-        return self._load(_Origin(path.stem, str(path), ""), lambda: _import_file(path))
+        return self._load(_Origin(path.stem, str(path), ""), lambda: import_file(path))
 
     def _load(self, origin: _Origin, load: Callable[[], object]) -> Failure | None:
         try:
@@ -184,7 +180,7 @@ class Plugins:
             entries = self._collect(plugin, origin)
         except pluggy.PluginValidationError as error:
             self._drop(plugin)
-            return self._fail(origin, _explain(error))
+            return self._fail(origin, explained(error))
         except PluginError as error:
             self._drop(plugin)
             return self._fail(origin, str(error))
@@ -207,14 +203,14 @@ class Plugins:
                     raise PluginError(f"{caller.name}: a hook of droidw cannot be wrapped")
                 answer = impl.function()
                 entries.extend(
-                    Entry(_HOOKS[caller.name], component, origin.plugin, origin.distribution,
+                    Entry(HOOKS[caller.name], component, origin.plugin, origin.distribution,
                           origin.version)
-                    for component in _components(caller.name, answer)
+                    for component in checked_components(caller.name, answer)
                 )
         if not callers:
             raise PluginError(
                 "it offers nothing: no function in it is marked with @droidw.hookimpl",
-                "hooks: " + ", ".join(_HOOKS),
+                "hooks: " + ", ".join(HOOKS),
             )
         return entries
 
@@ -295,61 +291,6 @@ def register(
     return plugins
 
 
-def _components(hook: str, answer: object) -> list[Component[Any]]:
-    """Check what a hook returned."""
-    if isinstance(answer, (Component, str, bytes)) or not isinstance(answer, Iterable):
-        raise PluginError(
-            f"{hook} returned {_described(answer)}; it must yield Component records "
-            "(write `yield droidw.Component(...)`)"
-        )
-    found: list[Component[Any]] = []
-    for item in answer:
-        problem = _problem(item)
-        if problem:
-            raise PluginError(f"{hook}: {problem}")
-        if any(item.name == other.name for other in found):
-            raise PluginError(f"{hook} yielded two components called '{item.name}'")
-        found.append(item)
-    return found
-
-
-def _problem(item: Any) -> str:
-    """What is wrong with a component, or ""."""
-    if not isinstance(item, Component):
-        return f"yielded {_described(item)} where a droidw.Component is expected"
-    if not _NAME.fullmatch(str(item.name)):
-        return f"the name {item.name!r} is not lower-case kebab, such as 'my-part'"
-    if not callable(item.factory):
-        return f"'{item.name}': factory is {_described(item.factory)}, not callable"
-    if not dataclasses.is_dataclass(item.options) or not callable(item.options):
-        return f"'{item.name}': options is {_described(item.options)}, not a dataclass"
-    for entry in dataclasses.fields(item.options):
-        missing = dataclasses.MISSING
-        if entry.default is missing and entry.default_factory is missing:
-            return f"'{item.name}': option '{entry.name}' has no default"
-    for attribute in ("requires", "weights", "capabilities"):
-        value = getattr(item, attribute)
-        if isinstance(value, str) or not all(isinstance(part, str) for part in value):
-            return f"'{item.name}': {attribute} is {value!r}, not a collection of strings"
-    return ""
-
-
-def _described(value: object) -> str:
-    return "nothing (None)" if value is None else f"a {type(value).__name__} ({value!r})"
-
-
-def _explain(error: pluggy.PluginValidationError) -> str:
-    """pluggy's complaint as one line, with the nearest hook if the name is unknown."""
-    text = " ".join(str(error).split())
-    match = re.search(r"unknown hook '(\w+)'", text)
-    if not match:
-        return text
-    near = nearest(match[1], _HOOKS)
-    return f"unknown hook '{match[1]}'" + (
-        f"; did you mean '{near}'?" if near else "; hooks: " + ", ".join(_HOOKS)
-    )
-
-
 def _raised(failure: Failure) -> PluginError:
     return PluginError(
         f"plugin '{failure.name}' ({failure.origin}) failed to load: {failure.error}",
@@ -359,23 +300,6 @@ def _raised(failure: Failure) -> PluginError:
 
 def _trace(error: BaseException) -> str:
     return "".join(traceback.format_exception(type(error), error, error.__traceback__))
-
-
-def _import_file(path: Path) -> ModuleType:
-    digest = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
-    name = f"_droidw_plugin_{digest}_{re.sub(r'[^0-9a-zA-Z_]', '_', path.stem)}"
-    spec = util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ImportError(f"{path} is not a Python file (its name must end in .py)")
-    module = util.module_from_spec(spec)
-    # dataclasses look their module up there while the file is executed
-    sys.modules[name] = module
-    try:
-        spec.loader.exec_module(module)
-    except BaseException:
-        del sys.modules[name]
-        raise
-    return module
 
 
 def _dist(point: metadata.EntryPoint) -> tuple[str, str]:
