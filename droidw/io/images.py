@@ -64,6 +64,9 @@ def _jpeg_is_cut(data: bytes) -> bool:
     """Whether no end mark follows the first scan; a thumbnail in the header has its own."""
     at = 2
     while data[at : at + 1] == b"\xff" and at + 4 <= len(data):
+        if data[at + 1] == 0xFF:
+            at += 1  # padding before a mark
+            continue
         if data[at + 1] == 0xDA:
             return data.find(b"\xff\xd9", at) < 0
         at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
