@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from droidw.plugin.component import BuildContext, Component, NoOptions
 
 if TYPE_CHECKING:
-    from droidw.interfaces.depth import DepthMap
+    from droidw.interfaces.depth import DepthMap, DepthPrior
     from droidw.slam.frame import Frame
 
 __all__ = ["COMPONENT", "NoDepth"]
@@ -27,7 +27,7 @@ def _build(options: NoOptions, context: BuildContext) -> NoDepth:
     return NoDepth()
 
 
-COMPONENT = Component(
+COMPONENT: Component[DepthPrior] = Component(
     name="none",
     summary="no depth prior; the scale of the result is arbitrary",
     factory=_build,

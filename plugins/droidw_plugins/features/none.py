@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from droidw.geometry.camera import Grid
+    from droidw.interfaces.features import FeatureExtractor
 
 __all__ = ["COMPONENT", "NoFeatures"]
 
@@ -28,7 +29,7 @@ def _build(options: NoOptions, context: BuildContext) -> NoFeatures:
     return NoFeatures()
 
 
-COMPONENT = Component(
+COMPONENT: Component[FeatureExtractor] = Component(
     name="none",
     summary="no features; for uncertainty models that need none",
     factory=_build,

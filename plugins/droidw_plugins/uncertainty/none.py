@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from droidw.interfaces.uncertainty import StoreField, UncertaintyReport, UncertaintyView
 from droidw.plugin.component import BuildContext, Component, NoOptions
+
+if TYPE_CHECKING:
+    from droidw.interfaces.uncertainty import UncertaintyModel
 
 __all__ = ["COMPONENT", "NoUncertainty"]
 
@@ -35,7 +38,7 @@ def _build(options: NoOptions, context: BuildContext) -> NoUncertainty:
     return NoUncertainty()
 
 
-COMPONENT = Component(
+COMPONENT: Component[UncertaintyModel] = Component(
     name="none",
     summary="every pixel is trusted; plain bundle adjustment",
     factory=_build,
