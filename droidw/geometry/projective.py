@@ -186,5 +186,5 @@ def _homogeneous(h: int, w: int, like: Tensor) -> Tensor:
 
 def _transform(R: Tensor, t: Tensor, rays: Tensor, d: Tensor) -> Tensor:
     """R [E,3,3] rays [3,P] + d [E,P] t [E,3] for every edge, [E, 3, P]: two matrix products."""
-    turned = (R.reshape(-1, 3) @ rays).view(R.shape[0], 3, -1)
+    turned = (R.reshape(-1, 3) @ rays).view(R.shape[0], 3, rays.shape[1])
     return torch.baddbmm(turned, t[:, :, None], d[:, None])

@@ -192,7 +192,7 @@ def skew(v: Tensor) -> Tensor:
 
 def _joint_shape(a: torch.Size, b: torch.Size) -> torch.Size:
     """Shape that two leading shapes broadcast to."""
-    return torch.empty(a, device="meta").add(torch.empty(b, device="meta")).shape
+    return torch.broadcast_shapes(a, b)
 
 
 def _poly(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:

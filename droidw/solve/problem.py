@@ -31,7 +31,8 @@ class BAProblem:
         prior_weight: gamma_d of REFERENCE 3.2.
         motion_only: move poses, leave depths.
         lm, ep: diag(S) <- diag(S) * (1 + lm) + ep on the reduced system.
-        huber: threshold in cells of a Huber kernel on the residual length, or None.
+        huber: threshold in cells of a Huber kernel on the residual length s, or None; where the
+            weights of x and y differ, s^2 = sum(weight r^2) / mean(weight) over the two.
         min_disp, max_disp: bounds of the disparity after the step (max None: unbounded).
         guard: evaluate the energy after the step; shorten the step while it rose, and reject it
             if no shorter one lowers the energy.

@@ -121,16 +121,23 @@ def energy(
     """
     total = torch.zeros((), dtype=torch.float64, device=disps.device)
     for c in _project(problem, layout, T_cw, disps, work, chunk, None):
-        weight = c.weight.transpose(1, 2)
-        squared = c.r * c.r
+        weight = c.weight.transpose(1, 2) * valid[c.part].unsqueeze(1)
+        cells = (weight * c.r * c.r).sum(1)
         if problem.huber is not None:
-            length = squared.sum(1).sqrt_()
-            knee = (problem.huber / length.clamp_min(problem.huber)).unsqueeze(1)
-            squared *= knee * (2.0 - knee)  # 1 inside the threshold, (2hs - h^2) / s^2 outside
-        squared *= weight
-        squared *= valid[c.part].unsqueeze(1)
-        total += squared.sum((1, 2)).double().sum()
+            knee = problem.huber / _length(cells, weight).clamp_(min=problem.huber)
+            cells *= knee * (2.0 - knee)  # 1 inside the threshold, (2hs - h^2) / s^2 outside
+        total += cells.sum(1).double().sum()
     return float(total)
+
+
+def _length(cells: Tensor, weight: Tensor) -> Tensor:
+    """Residual length s [n,P] that a robust kernel sees, cells.
+
+    Where the weights of x and y [n,2,P] differ, so do their shares: s^2 = W r^2 / mean(W), with
+    W r^2 in `cells`. The reweighted step is then the exact gradient of mean(W) rho(s).
+    """
+    mean = weight.mean(1).clamp_(min=torch.finfo(weight.dtype).tiny)
+    return (cells / mean).sqrt_()
 
 
 def _project(
@@ -201,8 +208,8 @@ def _weighted_rows(
     root = work.take("root", n, 2, n_cells, like=c.d)
     torch.mul(c.weight.transpose(1, 2), c.ok[:, None], out=root)
     if huber is not None:
-        # iteratively reweighted least squares: weight h / |r| beyond the threshold
-        length = torch.hypot(c.r[:, 0], c.r[:, 1])
+        # iteratively reweighted least squares: weight h / s beyond the threshold
+        length = _length((root * c.r * c.r).sum(1), root)
         root *= (huber / length.clamp_(min=huber)).unsqueeze(1)
     root.sqrt_()
     torch.mul(root, c.r, out=rows[:, :, 6])

@@ -110,16 +110,17 @@ def solve_reduced(S: Tensor, g: Tensor, lm: float, ep: float, floor: float) -> T
 
     Args:
         lm, ep: diag(S) <- diag(S) * (1 + lm) + ep.
-        floor: least pivot, relative to its diagonal entry, that is not taken for rounding.
+        floor: share of its diagonal entry below which a pivot is taken for rounding, unless
+            the damping added more than that.
     """
     S = 0.5 * (S + S.T)
     diagonal = S.diagonal()
-    diagonal.mul_(1.0 + lm).add_(ep)
+    added = lm * diagonal + ep
+    # damping of that size vouches for every pivot: the undamped system has no negative ones
+    least = torch.where(added < floor * diagonal, floor * diagonal, torch.zeros_like(added))
+    diagonal += added
     L, info = torch.linalg.cholesky_ex(S)
-    if int(info) != 0:
-        return None
-    pivots = L.diagonal().square()
-    if not bool((pivots > floor * diagonal).all()):
+    if int(info) != 0 or not bool((L.diagonal().square() > least).all()):
         return None
     return torch.cholesky_solve(g[:, None], L).view(-1, 6)
 
@@ -167,5 +168,6 @@ def _depth_system(
         rhs -= known * (problem.disps.flatten(1)[layout.sources] - prior)
     else:
         C += damping
-    Q = torch.where(C > torch.finfo(C.dtype).tiny * 1e8, C.reciprocal(), torch.zeros_like(C))
+    least = torch.finfo(C.dtype).tiny * 1e8
+    Q = torch.where(C > least, C.reciprocal(), torch.zeros_like(C))
     return DepthSystem(Q, rhs)

@@ -1,0 +1,52 @@
+"""A small synthetic bundle adjustment problem with exact flow."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from droidw.geometry import projective, se3
+from droidw.solve.problem import BAProblem
+
+
+def make_problem(n=5, h=6, w=8, reach=2, dtype=torch.float64, noise=0.0, seed=0, **changes):
+    """n cameras on a curve over a wavy surface; `noise` perturbs the start, not the flow."""
+    g = torch.Generator().manual_seed(seed)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=g, dtype=torch.float64).to(dtype)
+
+    s = torch.linspace(0, 1, n, dtype=torch.float64)
+    path = (0.6 * s, 0.1 * (4 * s).sin(), 0.2 * s, 0.05 * (3 * s).sin(), 0.1 * s, 0.03 * s)
+    T_cw = se3.exp(torch.stack(path, dim=1)).to(dtype)
+    K = torch.tensor([0.9 * w, 0.95 * w, w / 2 - 0.4, h / 2 - 0.6], dtype=dtype)
+    x, y = projective.pixel_grid(h, w, dtype).unbind(-1)
+    k = torch.arange(n, dtype=dtype)[:, None, None]
+    disps = 0.5 + 0.2 * (0.5 * x + k).sin() + 0.15 * (0.7 * y + 0.3 * k).cos()
+    edges = [(i, j) for i in range(n) for j in range(n) if i != j and abs(i - j) <= reach]
+    ii, jj = torch.tensor(edges).T.contiguous()
+    target, _ = projective.reproject(T_cw, disps, K, ii, jj)
+    weight = 0.1 + torch.rand(target.shape, generator=g, dtype=torch.float64).to(dtype)
+    fixed = torch.zeros(n, dtype=torch.bool)
+    fixed[0] = True
+    xi = noise * draw(n, 6)
+    xi[0] = 0
+    problem = BAProblem(
+        T_cw=se3.retract(T_cw, xi),
+        disps=disps * (1 + 4 * noise * draw(*disps.shape)).clamp(0.2, 3.0),
+        intrinsics=K,
+        ii=ii,
+        jj=jj,
+        target=target,
+        weight=weight,
+        fixed=fixed,
+        damping=torch.full_like(disps, 1e-6),
+    )
+    return replace(problem, **changes), T_cw, disps
+
+
+@pytest.fixture
+def make():
+    return make_problem

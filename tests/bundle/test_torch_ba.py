@@ -1,0 +1,247 @@
+"""The torch backend against dense normal equations, and its promises about every step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from droidw.geometry import projective, se3
+from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster, TorchBundleOptions
+
+
+def step(problem, **options):
+    return TorchBundleAdjuster(TorchBundleOptions(**options)).step(problem)
+
+
+def robust_length(weight, r):
+    return ((weight * r * r).sum(-1, keepdim=True) / weight.mean(-1, keepdim=True)).sqrt()
+
+
+def dense_step(p):
+    """The same step by the full normal equations over all poses and depths."""
+    n, h, w = p.disps.shape
+    cells, n_pose = h * w, 6 * n
+    J_i, J_j, J_z = projective.jacobians(p.T_cw, p.disps, p.intrinsics, p.ii, p.jj)
+    coords, valid = projective.reproject(p.T_cw, p.disps, p.intrinsics, p.ii, p.jj)
+    residual = p.target - coords
+    weight = p.weight * valid[..., None]
+    if p.huber is not None:
+        length = robust_length(weight, residual)
+        weight = weight * (p.huber / length.clamp_min(p.huber))
+    size = n_pose + n * cells
+    H, g = torch.zeros(size, size, dtype=torch.float64), torch.zeros(size, dtype=torch.float64)
+    for e in range(len(p.ii)):
+        i, j = int(p.ii[e]), int(p.jj[e])
+        J = torch.zeros(2 * cells, size, dtype=torch.float64)
+        J[:, 6 * i : 6 * i + 6] += J_i[e].reshape(-1, 6)
+        J[:, 6 * j : 6 * j + 6] += J_j[e].reshape(-1, 6)
+        for c in range(cells):
+            J[2 * c : 2 * c + 2, n_pose + i * cells + c] = J_z[e].view(-1, 2)[c]
+        W = weight[e].flatten()
+        H += J.T @ (W[:, None] * J)
+        g += J.T @ (W * residual[e].flatten())
+    d, diagonal = p.disps.flatten(), p.damping.flatten()
+    moves = ~p.fixed
+    moves[p.ii] = True
+    if p.prior is not None:
+        known = (p.prior > 0).flatten()
+        diagonal = torch.where(known, torch.full_like(d, p.prior_weight), diagonal)
+        g[n_pose:] -= torch.where(known, p.prior_weight * (d - p.prior.flatten()), 0 * d)
+    H[n_pose:, n_pose:] += torch.diag(diagonal)
+    free = torch.nonzero((~p.fixed)[:, None].expand(n, 6).flatten()).flatten()
+    deep = n_pose + torch.nonzero(moves[:, None].expand(n, cells).flatten()).flatten()
+    A, b = H[free][:, free], g[free]
+    if not p.motion_only:
+        solve = torch.linalg.solve(H[deep][:, deep], H[deep][:, free])
+        A = A - H[free][:, deep] @ solve
+        b = b - solve.T @ g[deep]
+    A = A + torch.diag(p.lm * A.diagonal() + p.ep)
+    dx = torch.zeros(n_pose, dtype=torch.float64)
+    dx[free] = torch.linalg.solve(A, b)
+    disps = p.disps.clone()
+    if not p.motion_only:
+        right = g[deep] - H[deep][:, free] @ dx[free]
+        disps.view(-1)[deep - n_pose] += torch.linalg.solve(H[deep][:, deep], right)
+        disps.clamp_(p.min_disp, p.max_disp)
+    return se3.retract(p.T_cw, dx.view(n, 6)), disps, dx.view(n, 6)
+
+
+def prior_of(disps):
+    prior = 1.1 * disps + 0.05
+    prior[:, ::2, 1::3] = 0.0
+    return prior
+
+
+CASES = {
+    "plain": {},
+    "damped": {"lm": 0.03, "ep": 0.2},
+    "motion-only": {"motion_only": True},
+    "two fixed": {"fixed": torch.tensor([True, False, True, False, False])},
+    "last fixed": {"fixed": torch.tensor([False, False, False, False, True])},
+    "all fixed": {"fixed": torch.ones(5, dtype=torch.bool)},
+    "none fixed": {"fixed": torch.zeros(5, dtype=torch.bool), "lm": 1e-3},
+    "huber": {"huber": 0.3},
+    "bounds": {"min_disp": 0.3, "max_disp": 0.7},
+    "no edge from 2": {"leave_out_source": 2},
+    "fixed without edges from": {
+        "leave_out_source": 2,
+        "fixed": torch.tensor([True, False, True, False, False]),
+    },
+}
+
+
+@pytest.mark.parametrize("with_prior", [False, True])
+@pytest.mark.parametrize("case", CASES)
+def test_schur_solution_is_the_dense_one(make, case, with_prior):
+    changes = dict(CASES[case])
+    left_out = changes.pop("leave_out_source", None)
+    p, _, _ = make(noise=0.02, **changes)
+    damping = 1e-3 + 1e-2 * torch.rand(p.disps.shape, dtype=torch.float64)
+    p = replace(p, damping=damping)
+    if left_out is not None:
+        keep = p.ii != left_out
+        p = replace(p, ii=p.ii[keep], jj=p.jj[keep], target=p.target[keep], weight=p.weight[keep])
+    if with_prior:
+        p = replace(p, prior=prior_of(p.disps), prior_weight=0.4)
+    T_cw, disps, dx = dense_step(p)
+    got = step(p)
+    assert got.report.status == "ok"
+    torch.testing.assert_close(got.T_cw, T_cw, atol=1e-8, rtol=0)
+    torch.testing.assert_close(got.disps, disps, atol=1e-8, rtol=0)
+    assert got.report.step_norm == pytest.approx(float(dx.norm(dim=1).max()), abs=1e-8)
+    assert torch.equal(got.T_cw[p.fixed], p.T_cw[p.fixed])
+
+
+def test_near_cells_do_not_count(make):
+    p, _, _ = make(noise=0.01)
+    disps = p.disps.clone()
+    T_cw = p.T_cw.clone()
+    T_cw[2, 2] -= 1.2  # camera 2 moves among the points: some cells fail the near test
+    p = replace(p, T_cw=T_cw, disps=disps, ep=1.0)
+    _, valid = projective.reproject(T_cw, disps, p.intrinsics, p.ii, p.jj)
+    assert 0 < int((~valid).sum()) < valid.numel() // 2
+    expected_T, expected_disps, _ = dense_step(p)
+    got = step(p)
+    torch.testing.assert_close(got.T_cw, expected_T, atol=1e-8, rtol=0)
+    torch.testing.assert_close(got.disps, expected_disps, atol=1e-8, rtol=1e-8)
+
+
+def test_energy_is_what_the_problem_defines(make):
+    p, _, _ = make(noise=0.02)
+    p = replace(p, prior=prior_of(p.disps), prior_weight=0.4)
+    coords, _ = projective.reproject(p.T_cw, p.disps, p.intrinsics, p.ii, p.jj)
+    r = p.target - coords
+    prior = 0.4 * ((p.disps - p.prior)[p.prior > 0] ** 2).sum()
+    expected = float((p.weight * r * r).sum() + prior)
+    assert step(p).report.cost_before == pytest.approx(expected, rel=1e-12)
+    assert step(replace(p, guard=True)).report.cost_before == pytest.approx(expected, rel=1e-12)
+    length = robust_length(p.weight, r)
+    rho = torch.where(length <= 0.2, length**2, 0.4 * length - 0.04) / length**2
+    expected = float((p.weight * r * r * rho).sum() + prior)
+    assert step(replace(p, huber=0.2)).report.cost_before == pytest.approx(expected, rel=1e-12)
+
+
+def test_robust_length_is_the_plain_one_for_equal_weights(make):
+    p, _, _ = make(noise=0.02, huber=0.2)
+    weight = p.weight.mean(-1, keepdim=True).expand_as(p.weight)
+    coords, _ = projective.reproject(p.T_cw, p.disps, p.intrinsics, p.ii, p.jj)
+    length = (p.target - coords).norm(dim=-1)
+    rho = torch.where(length <= 0.2, length**2, 0.4 * length - 0.04)
+    expected = float((weight[..., 0] * rho).sum())
+    assert step(replace(p, weight=weight)).report.cost_before == pytest.approx(expected, rel=1e-12)
+
+
+def test_depths_stay_and_priors_are_left_alone_in_motion_only(make):
+    p, _, _ = make(noise=0.02, motion_only=True, min_disp=0.4)
+    got = step(replace(p, prior=prior_of(p.disps), prior_weight=1.0))
+    assert torch.equal(got.disps, p.disps)
+    assert got.disps.data_ptr() != p.disps.data_ptr()
+
+
+def test_the_input_is_not_written_to(make):
+    p, _, _ = make(noise=0.02, guard=True)
+    before = [t.clone() for t in (p.T_cw, p.disps, p.target, p.weight, p.fixed, p.damping)]
+    got = step(p)
+    after = (p.T_cw, p.disps, p.target, p.weight, p.fixed, p.damping)
+    assert all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+    assert got.T_cw.data_ptr() != p.T_cw.data_ptr()
+
+
+def shuffled(p, seed):
+    order = torch.randperm(len(p.ii), generator=torch.Generator().manual_seed(seed))
+    return replace(
+        p, ii=p.ii[order], jj=p.jj[order], target=p.target[order], weight=p.weight[order]
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_order_of_the_edges_changes_nothing(make, dtype):
+    p, _, _ = make(noise=0.02, dtype=dtype)
+    expected = step(p)
+    for seed in range(3):
+        got = step(shuffled(p, seed))
+        assert torch.equal(got.T_cw, expected.T_cw)
+        assert torch.equal(got.disps, expected.disps)
+
+
+def test_an_edge_given_twice_counts_twice(make):
+    p, _, _ = make(noise=0.02)
+    twice = replace(
+        p,
+        ii=torch.cat((p.ii, p.ii[:3])),
+        jj=torch.cat((p.jj, p.jj[:3])),
+        target=torch.cat((p.target, p.target[:3] + 0.1)),
+        weight=torch.cat((p.weight, p.weight[:3])),
+    )
+    T_cw, disps, _ = dense_step(twice)
+    for seed in range(3):
+        got = step(shuffled(twice, seed))
+        torch.testing.assert_close(got.T_cw, T_cw, atol=1e-9, rtol=0)
+        torch.testing.assert_close(got.disps, disps, atol=1e-9, rtol=0)
+
+
+def test_same_input_same_bytes_also_from_used_scratch_space(make):
+    p, _, _ = make(noise=0.02, dtype=torch.float32)
+    other, _, _ = make(n=7, h=9, w=7, noise=0.05, dtype=torch.float32, guard=True)
+    adjuster = TorchBundleAdjuster()
+    first = adjuster.step(p)
+    adjuster.step(other)
+    again = adjuster.step(p)
+    fresh = step(p)
+    for got in (again, fresh):
+        assert torch.equal(got.T_cw, first.T_cw)
+        assert torch.equal(got.disps, first.disps)
+        assert got.report == fresh.report
+
+
+def test_chunks_change_nothing_that_matters(make):
+    p, _, _ = make(noise=0.02, guard=True)
+    whole, parts = step(p), step(p, chunk_cells=100)
+    torch.testing.assert_close(parts.T_cw, whole.T_cw, atol=1e-12, rtol=0)
+    torch.testing.assert_close(parts.disps, whole.disps, atol=1e-11, rtol=0)
+
+
+def test_single_precision_is_close_to_double(make):
+    p, _, _ = make(noise=0.02)
+    exact = step(p)
+    single = {
+        name: value.float()
+        for name, value in vars(p).items()
+        if isinstance(value, torch.Tensor) and value.is_floating_point()
+    }
+    got = step(replace(p, **single))
+    assert got.T_cw.dtype == torch.float32
+    torch.testing.assert_close(got.T_cw.double(), exact.T_cw, atol=2e-4, rtol=0)
+    torch.testing.assert_close(got.disps.double(), exact.disps, atol=2e-3, rtol=0)
+
+
+def test_component_is_light_and_builds():
+    from droidw.interfaces.bundle import BundleAdjuster
+    from droidw.plugin.component import BuildContext
+    from droidw_plugins.bundle.torch_ba import COMPONENT
+
+    assert COMPONENT.name == "torch"
+    built = COMPONENT.factory(COMPONENT.options(), BuildContext(device=torch.device("cpu")))
+    assert isinstance(built, BundleAdjuster)
