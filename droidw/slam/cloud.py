@@ -90,7 +90,7 @@ def static_cloud(
         keep &= depth < options.far * depth[keep].median()
     rays = _rays(store)
     T_wc = se3.inv(store.T_cw)  # noqa: N806
-    points = se3.act(T_wc, (rays[None] * depth[..., None]).flatten(1, 2))
+    points = se3.act(T_wc[:, None], (rays[None] * depth[..., None]).flatten(1, 2))
     chosen = keep.flatten().nonzero()[:, 0]
     if len(chosen) > options.max_points:
         step = len(chosen) / options.max_points

@@ -81,7 +81,7 @@ class FlowCorrespondence:
         for dx, dy in ((1, 0), (0, 1)):
             slope = cv2.Scharr(scaled, cv2.CV_32F, dx, dy, scale=1 / 32)
             energy = cv2.blur(slope * slope, window, borderType=cv2.BORDER_REPLICATE)
-            texture.append(np.sqrt(_at(energy, centres)))
+            texture.append(np.sqrt(np.maximum(_at(energy, centres), 0.0)))
         grey8 = np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
         return FlowFrame(frame.index, grey8, np.stack(texture, -1), centres, self.stride)
 
