@@ -340,8 +340,8 @@ def _undistortion_maps(
     K = camera.matrix()
     size = (camera.width, camera.height)
     coefficients = np.array(camera.distortion, dtype=np.float64)
-    build = cv2.fisheye.initUndistortRectifyMap if camera.model == "fisheye" else (
-        cv2.initUndistortRectifyMap
+    library = cv2.fisheye if camera.model == "fisheye" else cv2
+    first, second = library.initUndistortRectifyMap(
+        K, coefficients, np.eye(3), K, size, cv2.CV_16SC2
     )
-    first, second = build(K, coefficients, np.eye(3), K, size, cv2.CV_16SC2)
     return np.asarray(first, dtype=np.int16), np.asarray(second, dtype=np.uint16)

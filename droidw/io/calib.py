@@ -133,8 +133,7 @@ def _from_droid(path: Path, lines: _Lines, width: int, height: int) -> tuple[Cam
     where = f"{path}, line {number}"
     if len(lines) > 1:
         raise InputError(
-            f"{path}, line {lines[1][0]}: a second line, but a calibration of bare numbers "
-            "has one",
+            f"{path}, line {lines[1][0]}: a second line, but a calibration of bare numbers has one",
             _VALID,
         )
     return _camera(width, height, _numbers(fields, where), where), where

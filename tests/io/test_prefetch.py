@@ -41,11 +41,10 @@ def test_an_exception_comes_at_its_place():
         yield 2
         raise InputError("the disk is on fire")
 
-    seen = []
+    ahead = prefetch(source())
+    assert [next(ahead), next(ahead)] == [1, 2]
     with pytest.raises(InputError, match="on fire"):
-        for item in prefetch(source()):
-            seen.append(item)
-    assert seen == [1, 2]
+        next(ahead)
     assert threads() == []
 
 

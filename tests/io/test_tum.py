@@ -78,7 +78,7 @@ def test_values_that_are_not_finite_leave_an_older_file_alone(tmp_path):
 
 
 def test_a_folder_that_is_not_there_is_a_sentence(tmp_path):
-    with pytest.raises(UsageError, match="cannot write .*No such file"):
+    with pytest.raises(UsageError, match=r"cannot write .*No such file"):
         write_tum(tmp_path / "no" / "a.tum", made_up())
 
 

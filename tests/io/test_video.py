@@ -111,9 +111,7 @@ def test_times_that_repeat_are_skipped_and_counted(videos, tmp_path):
     frames, problems, skipped = decode(path)
     np.testing.assert_allclose([f.time for f in frames], [0, 0.04, 0.08, 0.12, 0.16])
     assert skipped == 1
-    assert problems == [
-        "a.mkv, picture 2: its time 0.040000 s repeats or runs backwards, skipped"
-    ]
+    assert problems == ["a.mkv, picture 2: its time 0.040000 s repeats or runs backwards, skipped"]
 
 
 def test_pictures_of_another_size_are_skipped_and_counted(videos, tmp_path):

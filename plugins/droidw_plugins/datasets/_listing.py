@@ -61,9 +61,7 @@ def read_listing(path: Path, notes: Notes) -> list[Entry]:
             entries.append((position, time, path.parent / fields[1].strip()))
         position += 1
     if not entries:
-        raise InputError(
-            f"{path} names no picture", "lines look like `1.033333 rgb/000031.jpg`"
-        )
+        raise InputError(f"{path} names no picture", "lines look like `1.033333 rgb/000031.jpg`")
     return entries
 
 
@@ -131,8 +129,7 @@ class ListedSource:
         self._entries = [
             entry
             for entry in entries
-            if entry[0] >= selection.skip
-            and (entry[0] - selection.skip) % selection.stride == 0
+            if entry[0] >= selection.skip and (entry[0] - selection.skip) % selection.stride == 0
         ]
         if not self._entries:
             raise InputError(
