@@ -64,7 +64,11 @@ def typed(cls: type, data: Mapping[str, Any], prefix: str, loaded: LoadedConfig)
             would be valid.
     """
     try:
-        node = OmegaConf.merge(OmegaConf.structured(cls), OmegaConf.create(dict(data)))
+        defaults = OmegaConf.structured(cls)
+        for name, hint in typing.get_type_hints(cls).items():
+            if typing.get_origin(hint) is dict and isinstance(data.get(name), Mapping):
+                defaults[name] = {}  # else keys that were taken out would come back
+        node = OmegaConf.merge(defaults, OmegaConf.create(dict(data)))
         made = OmegaConf.to_object(node)
     except OmegaConfBaseException as error:
         key = str(getattr(error, "full_key", "") or "")

@@ -31,31 +31,29 @@ class Row:
     help: str
 
 
-def rows(cls: type, prefix: str = "") -> Iterator[Row]:
+def rows(cls: type, prefix: str = "", instance: Any = None) -> Iterator[Row]:
     """Every key of a dataclass of options, nested ones with their full key.
 
     Args:
         cls: a dataclass in which every field has a default.
         prefix: full key of the section, or "".
+        instance: holds the defaults, if they are not those of the class.
     """
     hints = typing.get_type_hints(cls)
-    instance = cls()
+    instance = cls() if instance is None else instance
     for entry in dataclasses.fields(cls):
         value = getattr(instance, entry.name)
         key = f"{prefix}.{entry.name}" if prefix else entry.name
         if dataclasses.is_dataclass(value):
             if prefix or entry.name not in KINDS:
-                yield from rows(type(value), key)
+                yield from rows(type(value), key, value)
             else:
                 noun = KINDS[entry.name].noun
                 name = str(getattr(value, "name", ""))
                 yield Row(key, "plugin", name, "", f"the {noun}: a name, or name and options")
         elif isinstance(value, dict) and any(map(dataclasses.is_dataclass, value.values())):
             for name, item in value.items():
-                for row in rows(type(item), f"{key}.{name}"):
-                    field_name = row.key.rpartition(".")[2]
-                    default = _flow(getattr(item, field_name))
-                    yield dataclasses.replace(row, default=default)
+                yield from rows(type(item), f"{key}.{name}", item)
         else:
             yield Row(
                 key,

@@ -59,12 +59,13 @@ class LoadedConfig:
     preset: str | None = None
 
     def source(self, key: str) -> Source | None:
-        """Where a key, or else the nearest section around it, was set."""
-        while key:
-            if key in self.sources:
-                return self.sources[key]
-            key = key.rpartition(".")[0]
-        return None
+        """Where a key, or else the nearest section around it, or anything in it, was set."""
+        around = key
+        while around:
+            if around in self.sources:
+                return self.sources[around]
+            around = around.rpartition(".")[0]
+        return next((s for k, s in self.sources.items() if k.startswith(key + ".")), None)
 
     def at(self, key: str) -> str:
         """The start of a message about a key: "my.yaml:3: camera.fov"."""

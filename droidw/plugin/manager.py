@@ -135,6 +135,7 @@ class Plugins:
 
     def load_entry_points(self, only: frozenset[str] | None) -> None:
         """Load what installed distributions offer; `only` limits the third-party ones."""
+        blocked = {_normal(name) for name in self._blocked}
         found_host = False
         points = sorted(metadata.entry_points(group=GROUP), key=lambda p: (_dist(p), p.name))
         for point in points:
@@ -143,7 +144,7 @@ class Plugins:
             found_host = found_host or host
             if only is not None and not host and _normal(distribution) not in only:
                 continue
-            if self._blocked & {point.name, distribution, _normal(distribution)}:
+            if blocked & {_normal(point.name), _normal(distribution)}:
                 continue
             self._load(_Origin(point.name, distribution, version), point.load)
         if not found_host:

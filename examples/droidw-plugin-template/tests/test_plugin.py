@@ -1,10 +1,11 @@
-import droidw
 import pytest
 import torch
-from droidw.geometry.camera import Grid
-from droidw.testing.conformance import check_feature_extractor
 from droidw_plugin_template import COMPONENT, GradientOptions
 from droidw_plugin_template.gradients import GradientFeatures
+
+import droidw
+from droidw.geometry.camera import Grid
+from droidw.testing.conformance import check_feature_extractor
 
 
 def test_it_keeps_the_contract_of_its_kind():

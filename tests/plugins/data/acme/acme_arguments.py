@@ -1,0 +1,8 @@
+"""Wants an argument that the hook does not have."""
+
+import droidw
+
+
+@droidw.hookimpl
+def droidw_exporters(folder):
+    return []
