@@ -54,7 +54,7 @@ def dataset_reader(subject: Subject, source: str) -> None:
         subject.expect("errors", False, "open of a source that is not there raised nothing")
     opened, frames = _open(subject, part, source, Selection(max_frames=_FEW))
     subject.expect("frames", bool(frames), f"{source} yields no frame")
-    if opened.length is not None and not opened.problems:
+    if opened.length is not None and opened.skipped == 0:
         subject.expect("length", opened.length == len(frames),
                        f"length is {opened.length}, but a pass yields {len(frames)} frames")
     _sequence(subject, frames)
@@ -65,7 +65,7 @@ def dataset_reader(subject: Subject, source: str) -> None:
     subject.expect("problems", problems == opened.problems and skipped == opened.skipped,
                    "problems or skipped grow after the first pass")
     _, some = _open(subject, part, source, Selection(stride=2, skip=1, max_frames=2))
-    if not problems:
+    if skipped == 0:
         expected = frames[1::2][:2]
         subject.expect("selection", [f.index for f in some] == [f.index for f in expected]
                        and [f.time for f in some] == [f.time for f in expected],
@@ -130,13 +130,17 @@ def sample_result(run_dir: Path | None = None) -> RunResult:
     scene = Scene(SceneSpec(width=64, height=48, frames=6, fps=10.0))
     y, x = np.mgrid[:6, :8].astype(np.float64)
     cells = np.stack([x, y], axis=-1) * 8 + 3.5
+    rows, columns = np.mgrid[:48, :64].astype(np.float64)
+    pixels = np.stack([columns, rows], axis=-1)
     records = []
     for index in (0, 2, 4):
-        frame = scene.render(index)
         depth = scene.depth_at(index, cells)
+        # Grey by distance: the textures of the scene take longer to paint than all the rest.
+        grey = np.clip(scene.depth_at(index, pixels) * 45, 0, 255).astype(np.uint8)
         moving = scene.correspond(index, index, cells).moving
         records.append(KeyframeRecord(
-            index, frame.time, f"{index:06d}", frame.image, frame.T_wc, scene.intrinsics,
+            index, scene.time(index), f"{index:06d}", np.stack([grey] * 3, axis=-1),
+            scene.T_wc(index), scene.intrinsics,
             (1 / depth).astype(np.float32), ~moving,
             np.where(moving, 2.0, 0.1).astype(np.float32),
             np.where(moving, 0.0, 1.0).astype(np.float32)))

@@ -21,11 +21,12 @@ _SIZES = ((160, 120), (131, 97))
 
 def _pictures(subject: Subject) -> Iterator[tuple[str, Tensor, Tensor]]:
     """Name, image and intrinsics: rendered at an even and an odd size, and without texture."""
+    scene = Scene(SceneSpec(width=160, height=120, frames=1))
+    picture = torch.from_numpy(scene.render(0).image).permute(2, 0, 1).float().div(255)
+    intrinsics = torch.from_numpy(scene.intrinsics).float()
     for width, height in _SIZES:
-        scene = Scene(SceneSpec(width=width, height=height, frames=1))
-        image = torch.from_numpy(scene.render(0).image).permute(2, 0, 1).float().div(255)
-        intrinsics = torch.from_numpy(scene.intrinsics).float()
-        yield (f"a picture of {width}x{height}", image.contiguous().to(subject.device),
+        image = picture[:, :height, :width].contiguous()
+        yield (f"a picture of {width}x{height}", image.to(subject.device),
                intrinsics.to(subject.device))
     black = torch.zeros(3, 72, 96, device=subject.device)
     yield "a black picture", black, torch.tensor([80.0, 80, 47.5, 35.5], device=subject.device)

@@ -22,7 +22,8 @@ def pixels(spec):
 def back_project(scene, depth):
     fx, fy, cx, cy = scene.intrinsics
     x, y = np.moveaxis(pixels(scene.spec), -1, 0)
-    return np.stack([(x - cx) / fx, (y - cy) / fy, np.ones(depth.shape)], axis=-1) * depth[..., None]
+    rays = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones(depth.shape)], axis=-1)
+    return rays * depth[..., None]
 
 
 def test_frame_has_the_promised_shapes():
