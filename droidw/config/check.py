@@ -14,7 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from droidw.config.describe import limits_text, type_text, within
 from droidw.config.load import LoadedConfig
-from droidw.errors import ConfigError
+from droidw.errors import ConfigError, PluginError
 from droidw.plugin.registry import nearest
 
 __all__ = ["check_keys", "check_ranges", "typed"]
@@ -62,9 +62,17 @@ def typed(cls: type, data: Mapping[str, Any], prefix: str, loaded: LoadedConfig)
     Raises:
         ConfigError: a value has the wrong type, or the dataclass itself refuses it; with what
             would be valid.
+        PluginError: the dataclass has a field of a type that YAML cannot hold.
     """
     try:
         defaults = OmegaConf.structured(cls)
+    except OmegaConfBaseException as error:
+        raise PluginError(
+            f"{prefix}: the options {cls.__name__} hold a type that a configuration cannot: "
+            + _first_line(error),
+            "valid: bool, int, float, str, Path, Enum, Literal; lists, tuples and dicts of them",
+        ) from error
+    try:
         for name, hint in typing.get_type_hints(cls).items():
             if typing.get_origin(hint) is dict and isinstance(data.get(name), Mapping):
                 defaults[name] = {}  # else keys that were taken out would come back

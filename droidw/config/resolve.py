@@ -9,6 +9,7 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import PurePath
 from typing import Any
 
@@ -57,7 +58,7 @@ class ResolvedConfig:
 
     def to_yaml(self) -> str:
         """A file that can be run again and resolves to the same configuration."""
-        lines = ["# Resolved configuration of a run; run it again with --config."]
+        lines = ["# Resolved configuration of a run; it can be run again and means the same."]
         if self.preset:
             lines.append(f"# preset: {self.preset}")
         lines += [
@@ -248,11 +249,13 @@ def _check_fit(
 
 
 def _plain(value: Any) -> Any:
-    """Dataclasses, tuples and paths as what YAML has."""
+    """Dataclasses, tuples, enums and paths as what YAML has."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
+    if isinstance(value, Enum):
+        return value.name
     return str(value) if isinstance(value, PurePath) else value

@@ -63,6 +63,7 @@ class Plugins:
         self.weights_dir = _weights_dir(environ)
         self._blocked = frozenset(_split(environ.get(DISABLE_VARIABLE, "")))
         self._entries: list[Entry] = []
+        self._met: set[str] = set()
         self._manager = pluggy.PluginManager(hookspecs.PROJECT)
         self._manager.add_hookspecs(hookspecs)
 
@@ -82,7 +83,7 @@ class Plugins:
         blocked = {
             e.component.name
             for e in entries
-            if self._blocked & {e.component.name, f"{kind}/{e.component.name}"}
+            if self._blocked & {e.component.name, _full_name(e)}
         }
         return Registry(
             KINDS[kind], entries, frozenset(blocked), tuple(self.failures), self.weights_dir
@@ -142,17 +143,27 @@ class Plugins:
             distribution, version = _dist(point)
             host = _normal(distribution) == HOST
             found_host = found_host or host
+            self._met |= {_normal(point.name), _normal(distribution)}
             if only is not None and not host and _normal(distribution) not in only:
                 continue
             if blocked & {_normal(point.name), _normal(distribution)}:
                 continue
             self._load(_Origin(point.name, distribution, version), point.load)
+        for name in sorted((only or frozenset()) - self._met):
+            _log.warning("%s: no installed distribution '%s' offers plugins", LOAD_VARIABLE, name)
         if not found_host:
             self._fail(
                 _Origin(HOST, HOST, "not installed"),
                 "droidw runs from a bare source tree, so its own plugins are not registered; "
                 "install it: pip install -e .",
             )
+
+    def warn_of_unknown(self) -> None:
+        """Log names in `DROIDW_DISABLE_PLUGINS` that switch nothing off: typing errors, mostly."""
+        parts = {name for e in self._entries for name in (e.component.name, _full_name(e))}
+        for name in sorted(self._blocked - parts):
+            if _normal(name) not in self._met:
+                _log.warning("%s: nothing is called '%s'", DISABLE_VARIABLE, name)
 
     def load_file(self, path: Path) -> Failure | None:
         """Load a plugin from a Python file; returns the failure, which is listed as well.
@@ -261,6 +272,7 @@ def load_plugins(
             raise _raised(failure)
     for item in extra:
         plugins.register(item)
+    plugins.warn_of_unknown()
     if strict:
         plugins.check()
     return plugins
@@ -290,6 +302,10 @@ def register(
     for kind, component in components.items():
         plugins.add(kind, component)
     return plugins
+
+
+def _full_name(entry: Entry) -> str:
+    return f"{entry.kind}/{entry.component.name}"
 
 
 def _raised(failure: Failure) -> PluginError:

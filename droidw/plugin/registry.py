@@ -154,6 +154,11 @@ class Registry:
         found = self._by_name.get(name, [])
         if not found:
             raise self._not_found(name)
+        if name in self.blocked:
+            raise MissingRequirementError(
+                f"the {self.kind.noun} '{name}' is switched off by DROIDW_DISABLE_PLUGINS",
+                f"take its name out of that variable, or choose another: {self._available()}",
+            )
         if len(found) > 1:
             origins = [f"{e.origin} (plugin '{e.plugin}')" for e in found]
             raise PluginError(
@@ -161,11 +166,6 @@ class Registry:
                 + " and by ".join(origins)
                 + "; a name must be unique within its kind",
                 f"switch one off: DROIDW_DISABLE_PLUGINS={found[-1].plugin}",
-            )
-        if name in self.blocked:
-            raise MissingRequirementError(
-                f"the {self.kind.noun} '{name}' is switched off by DROIDW_DISABLE_PLUGINS",
-                f"take its name out of that variable, or choose another: {self._available()}",
             )
         return found[0]
 
@@ -184,15 +184,15 @@ class Registry:
         found = self._by_name.get(name, [])
         if not found:
             raise self._not_found(name)
-        if len(found) > 1:
-            return "name clash: " + ", ".join(e.origin for e in found)
         if name in self.blocked:
             return "switched off"
+        if len(found) > 1:
+            return "name clash: " + ", ".join(e.origin for e in found)
         entry = found[0]
         component = entry.component
         packages = _missing_packages(component)
         if packages:
-            if component.extra:
+            if component.extra and entry.version:
                 return f"needs {entry.distribution}[{component.extra}]"
             return "needs " + ", ".join(packages)
         weights = self._missing_weights(component)
@@ -215,7 +215,7 @@ class Registry:
             verb = "package {} is" if len(packages) == 1 else "packages {} are"
             what = (
                 f"'{entry.distribution}[{component.extra}]'"
-                if component.extra
+                if component.extra and entry.version
                 else " ".join(packages)
             )
             raise MissingRequirementError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,11 @@ from droidw.config.load import load_config
 from droidw.config.resolve import resolve
 
 
+class Side(Enum):
+    left = 1
+    right = 2
+
+
 @dataclass(frozen=True)
 class LearnOptions:
     """Options of every kind that a plugin may have."""
@@ -21,6 +27,7 @@ class LearnOptions:
     mode: Literal["online", "frozen"] = "online"
     taps: tuple[int, ...] = (4,)
     path: Path | None = None
+    side: Side = Side.left
 
     def __post_init__(self) -> None:
         if self.mode == "frozen" and len(self.taps) > 1:
@@ -36,6 +43,12 @@ class OtherOptions:
 @dataclass(frozen=True)
 class TextOptions:
     binary: bool = True
+
+
+@dataclass(frozen=True)
+class OddOptions:
+    stream: object = field(default=None)
+    call: type(print) = print
 
 
 BOTH = frozenset({"cpu", "cuda"})
@@ -65,6 +78,7 @@ def plugins():
         ("correspondence", part("flow", capabilities=frozenset({"cpu"}))),
         ("correspondence", part("net")),
         ("reader", part("video")),
+        ("reader", part("odd", OddOptions)),
         ("exporter", part("trajectory")),
         ("exporter", part("ply", TextOptions)),
         ("observer", part("progress")),

@@ -13,7 +13,7 @@ import droidw
 from droidw.config.load import load_config
 from droidw.config.resolve import choose_preset, resolve
 from droidw.config.schema import DroidwConfig
-from droidw.errors import ConfigError, MissingRequirementError
+from droidw.errors import ConfigError, MissingRequirementError, PluginError
 from droidw.plugin.registry import PluginNotFound
 
 
@@ -44,8 +44,8 @@ def test_an_exporter_that_is_switched_off(resolved):
 
 def test_round_trip(resolved, tmp_path):
     first = resolved(
-        "uncertainty.options={lr: 1e-2, taps: [1, 2], path: a/b}", "exporters.ply=null",
-        "camera.size=[320, 240]", "schedule.window.updates=7", "global_solver.lm=1e-7",
+        "uncertainty.options={lr: 1e-2, taps: [1, 2], path: a/b, side: right}",
+        "exporters.ply=null", "camera.size=[320, 240]", "schedule.window.updates=7", "global_solver.lm=1e-7",
         "input.source='a: 1'",
     )  # fmt: skip
     path = tmp_path / "config.yaml"
@@ -102,7 +102,7 @@ PHASES = ", ".join(DroidwConfig().schedule)
          "  options of the plugin go below uncertainty.options"),
         ("uncertainty.options.l_r=0.1",
          "uncertainty.options.l_r: there is no such key\n  did you mean 'uncertainty.options.lr'?"
-         "   keys of uncertainty.options: lr, mode, taps, path"),
+         "   keys of uncertainty.options: lr, mode, taps, path, side"),
         ("uncertainty.options.lr=2",
          "uncertainty.options.lr: 2.0 is out of range\n  valid: > 0 and <= 1"),
         ("uncertainty.options.mode=off",
@@ -148,7 +148,7 @@ def test_parts_that_cannot_run_are_named_together(resolved):
     assert str(caught.value) == (
         "command line: depth.name: 'net' is registered but cannot run: Python package "
         "'acme_net' is missing\n"
-        "  install it: pip install 'registered from Python[net]'\n"
+        "  install it: pip install acme_net\n"
         "  or run without: depth=none\n"
         "  also: command line: exporters.plx: no exporter is called 'plx'"
     )
@@ -172,6 +172,11 @@ def test_parts_without_a_common_device(resolved):
         "correspondence.name: 'flow' runs only on cpu, where not all other parts do"
     )
     assert resolved("ba=cuda", "correspondence=net").devices == {"cuda"}
+
+
+def test_options_of_a_type_that_yaml_cannot_hold(resolved):
+    with pytest.raises(PluginError, match=r"reader\.options: the options OddOptions hold a type"):
+        resolved("reader=odd")
 
 
 def test_preset_paper_names_each_part_that_is_missing(resolved):

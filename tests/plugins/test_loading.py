@@ -38,7 +38,7 @@ def failure(plugins, name):
 
 
 def test_builtins_come_through_the_entry_points():
-    plugins = droidw.load_plugins(environ={})
+    plugins = droidw.load_plugins(environ={"DROIDW_LOAD_PLUGINS": ""})
     for kind in KINDS:
         registry = plugins.registry(kind)
         assert len(registry) > 0, f"{kind}: {plugins.failures}"
@@ -150,6 +150,15 @@ def test_load_list_limits_third_parties_only(acme, other, wanted, loaded):
     assert {e.distribution for e in plugins.entries()} == {"droidw"} | loaded
 
 
+def test_names_in_the_lists_that_mean_nothing_are_reported(caplog):
+    environ = {"DROIDW_LOAD_PLUGINS": "droidw-gone", "DROIDW_DISABLE_PLUGINS": "cnn,cmn"}
+    droidw.load_plugins(environ=environ)
+    assert caplog.messages == [
+        "DROIDW_LOAD_PLUGINS: no installed distribution 'droidw-gone' offers plugins",
+        "DROIDW_DISABLE_PLUGINS: nothing is called 'cmn'",
+    ]
+
+
 def test_missing_extra_says_what_to_install(acme):
     registry = droidw.load_plugins(environ={}).registry("depth")
     assert registry.status("acme-extra") == "needs droidw-acme[net]"
@@ -179,7 +188,7 @@ def test_other_things_that_can_be_missing(acme, tmp_path):
 
 def test_unknown_name_gets_the_nearest_and_the_list():
     with pytest.raises(PluginNotFound) as caught:
-        droidw.load_plugins(environ={}).registry("features").get("cn")
+        droidw.load_plugins(environ={"DROIDW_LOAD_PLUGINS": ""}).registry("features").get("cn")
     assert str(caught.value) == (
         "no feature extractor is called 'cn'\n"
         "  did you mean 'cnn'?   available: cnn, none\n"
