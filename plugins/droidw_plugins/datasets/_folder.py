@@ -44,7 +44,7 @@ class FolderReader:
     def recognises(self, source: str) -> bool:
         """Whether it is a folder with pictures, or one with no other folder in it."""
         path = Path(source)
-        if not path.is_dir() or looks_like_tum(path):
+        if not source or not path.is_dir() or looks_like_tum(path):
             return False
         if (path / "rgb.txt").is_file() or _picture_folder(path) is not None:
             return True
@@ -60,7 +60,9 @@ class FolderReader:
         else:
             entries = self._unlisted(path, problems)
         notes.finish()
-        out = ListedSource(path.resolve().name, entries, selection, problems, notes.skipped)
+        out = ListedSource(
+            path.resolve().name or "footage", entries, selection, problems, notes.skipped
+        )
         if (path / "camera.txt").is_file():
             out.camera, note = read_calibration(path / "camera.txt", *out.size)
             problems.extend([note] if note else [])
@@ -92,6 +94,8 @@ def existing_folder(source: str, expected: str) -> Path:
         InputError: it is not there or no folder.
     """
     path = Path(source)
+    if not source:
+        raise InputError("no folder was given", expected)
     if not path.exists():
         raise InputError(f"{source}: no such folder", expected)
     if not path.is_dir():

@@ -44,7 +44,7 @@ class TumReader:
     def recognises(self, source: str) -> bool:
         """Whether it is a folder in the layout of the download."""
         path = Path(source)
-        return path.is_dir() and looks_like_tum(path)
+        return bool(source) and path.is_dir() and looks_like_tum(path)
 
     def open(self, source: str, selection: Selection) -> ListedSource:
         """Open the sequence; see `DatasetReader.open`."""
