@@ -20,7 +20,8 @@ from droidw.errors import UsageError
 from droidw.slam.frame import Trajectory
 from droidw.testing import _textures as textures
 from droidw.testing._motion import CAMERA_PATHS, Pose, actor_path, camera_path, quaternion
-from droidw.testing._shapes import TEXEL, Body, Hits, cast, face_size
+from droidw.testing._room import FLOOR, furnish
+from droidw.testing._shapes import TEXEL, Hits, cast, face_size
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Camera
@@ -46,9 +47,6 @@ SCENES: dict[str, tuple[str, bool]] = {
     **{f"{motion}-no-moving": (motion, False) for motion in MOTIONS},
 }
 """Scenes by name: the camera path, and whether objects move."""
-
-_FLOOR, _CEILING = 1.2, -1.6
-
 
 @dataclass(frozen=True)
 class SceneSpec:
@@ -149,7 +147,7 @@ class Scene:
         rng = np.random.default_rng([self.spec.seed, 17])
         self._phases = rng.uniform(0, 2 * np.pi, 13)
         self._actor_phases = rng.uniform(0, 2 * np.pi, (2, 3))
-        self._bodies, self._rest = _furnish(rng, self.spec.moving)
+        self._bodies, self._rest = furnish(rng, self.spec.moving)
 
     @cached_property
     def _atlas(self) -> textures.Atlas:
@@ -296,7 +294,7 @@ class Scene:
             if body.actor:
                 kind = "ball" if body.kind == "ball" else "walker"
                 rest = actor_path(kind, self.time(index), self._actor_phases[body.actor - 1],
-                                  float(2 * body.half[1]), _FLOOR)
+                                  float(2 * body.half[1]), FLOOR)
             poses.append(rest)
         return poses
 
@@ -324,32 +322,3 @@ class Scene:
         # Between the short and the long side of the slanted footprint.
         level = np.log2(np.maximum(footprint, 1e-3)) - 0.5 * np.log2(np.maximum(hits.slant, 0.05))
         return atlas.sample(x, y, level.astype(np.float32))
-
-
-def _furnish(rng: np.random.Generator, moving: bool) -> tuple[list[Body], list[Pose]]:
-    """The room, its furniture and the actors; poses of actors are placeholders."""
-    from droidw.testing._motion import rotation
-
-    bodies: list[Body] = []
-    poses: list[Pose] = []
-
-    def add(kind: str, size: tuple[float, float, float], centre: tuple[float, float, float],
-            yaw: float = 0.0, actor: int = 0) -> None:
-        bodies.append(Body(kind, np.array(size) / 2, 6 * len(bodies), actor))
-        poses.append(Pose(rotation(yaw, 0.0, 0.0), np.array(centre)))
-
-    def vary(value: float, by: float) -> float:
-        return float(value + rng.uniform(-by, by))
-
-    add("room", (5.2, _FLOOR - _CEILING, 6.4), (0.0, (_FLOOR + _CEILING) / 2, 0.4))
-    for x, z, width, height, depth in ((-1.6, 2.3, 0.9, 0.8, 0.7), (1.7, 2.7, 0.7, 1.9, 0.5),
-                                       (0.3, 2.5, 0.7, 0.45, 0.5), (-0.7, 3.1, 0.5, 1.3, 0.4),
-                                       (-2.1, 0.9, 0.5, 1.2, 0.5), (2.0, 1.3, 0.6, 0.7, 0.6)):
-        tall = vary(height, 0.1)
-        wide, left, back = vary(width, 0.1), vary(x, 0.15), vary(z, 0.1)
-        add("box", (wide, tall, depth), (left, _FLOOR - tall / 2, back), vary(0.0, 0.5))
-    add("box", (0.3, 0.3, 0.3), (vary(0.9, 0.2), vary(-0.9, 0.15), vary(2.3, 0.3)), vary(0.4, 0.4))
-    if moving:
-        add("box", (0.52, 1.5, 0.36), (0.0, 0.0, 1.0), actor=1)
-        add("ball", (0.56, 0.56, 0.56), (0.0, 0.0, 1.0), actor=2)
-    return bodies, poses
