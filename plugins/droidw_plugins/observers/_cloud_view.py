@@ -17,6 +17,7 @@ __all__ = ["cloud_views", "splat"]
 Array = npt.NDArray[np.float64]
 _SIZE = (720, 470)
 _PATH_BGRA = (246, 130, 59, 255)
+_WHITE = (255, 255, 255, 255)
 
 # Name, turn about the vertical and tilt from above, in degrees.
 _VIEWS = (("from behind the camera", 14.0, 12.0), ("from above, to the side", -38.0, 42.0))
@@ -52,17 +53,26 @@ def cloud_views(result: RunResult, most: int) -> list[tuple[str, str, int, int]]
     path = (poses[:, :3] - origin) @ R_wc
     target = np.median(points, axis=0)
     radius = float(np.percentile(np.linalg.norm(points - target, axis=1), 80)) or 1.0
+    # Far enough to see the cameras too, which stand outside of what they look at.
+    reach = float(np.linalg.norm(path - target, axis=1).max()) if len(path) else 0.0
+    distance = max(2.1 * radius, 1.3 * min(reach, 4 * radius))
     views = []
     for name, turn, tilt in _VIEWS:
-        R, eye = _look(target, 2.1 * radius, turn, tilt)
-        picture = splat((points - eye) @ R.T, rgb, _SIZE, 1.05 * _SIZE[0])
-        _draw_path(picture, (path - eye) @ R.T, 1.05 * _SIZE[0], radius)
+        R, eye = _look(target, distance, turn, tilt)
+        seen = (points - eye) @ R.T
+        path_seen = (path - eye) @ R.T
+        lens = _fitting_lens(seen, path_seen[path_seen[:, 2] > 0.2 * distance])
+        picture = splat(seen, rgb, _SIZE, lens)
+        _draw_path(picture, path_seen, lens, 0.2 * distance)
         views.append((name, data_uri(picture, ".png"), *_SIZE))
     return views
 
 
 def splat(
-    points: Array, rgb: npt.NDArray[np.uint8], size: tuple[int, int], focal: float
+    points: Array,
+    rgb: npt.NDArray[np.uint8],
+    size: tuple[int, int],
+    lens: tuple[float, float, float],
 ) -> npt.NDArray[np.uint8]:
     """Draw points [N,3] of a camera frame as a BGRA picture [H,W,4]; nearer ones hide others.
 
@@ -70,54 +80,72 @@ def splat(
         points: x right, y down, z forward.
         rgb: [N,3] colours.
         size: width and height in pixels.
-        focal: focal length in pixels; the axis goes through the middle of the picture.
+        lens: focal length and principal point in pixels: f, cx, cy.
     """
     width, height = size
+    focal, cx, cy = lens
     z = points[:, 2]
     front = z > 1e-6
     points, rgb, z = points[front], rgb[front], z[front]
-    x = np.floor(focal * points[:, 0] / z + width / 2)
-    y = np.floor(focal * points[:, 1] / z + height / 2)
-    inside = (x >= 0) & (x < width - 1) & (y >= 0) & (y < height - 1)
+    x = np.floor(focal * points[:, 0] / z + cx)
+    y = np.floor(focal * points[:, 1] / z + cy)
+    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     index = y[inside].astype(np.int64) * width + x[inside].astype(np.int64)
     z, rgb = z[inside], rgb[inside]
     order = np.argsort(-z, kind="stable")
-    index, z, rgb = index[order], z[order], rgb[order]
-    colour = np.zeros((height * width, 3), dtype=np.uint8)
-    depth = np.full(height * width, np.inf)
-    for step in (0, 1, width, width + 1):
-        # From far to near: of several values for one pixel the last stays.
-        one = np.full(height * width, np.inf)
-        paint = np.zeros((height * width, 3), dtype=np.uint8)
-        one[index + step] = z
-        paint[index + step] = rgb
-        nearer = one < depth
-        depth[nearer], colour[nearer] = one[nearer], paint[nearer]
-    depth_map, picture = depth.reshape(height, width), colour.reshape(height, width, 3)
-    for _ in range(2):
-        _fill(depth_map, picture)
-    alpha = np.where(np.isfinite(depth_map), 255, 0).astype(np.uint8)
-    return np.ascontiguousarray(np.dstack([picture[..., ::-1], alpha]))
+    # From far to near: of several points in one pixel the last stays.
+    which = np.full(height * width, -1, dtype=np.int64)
+    which[index[order]] = order
+    depth = np.full(height * width, np.inf, dtype=np.float32)
+    hit = which >= 0
+    if not hit.any():
+        return np.zeros((height, width, 4), dtype=np.uint8)
+    depth[hit] = z[which[hit]]
+    # Points grow until neighbours touch: a thin cloud is drawn with larger ones.
+    grow = int(np.clip(math.ceil(1.2 * math.sqrt(width * height / hit.sum())), 2, 7))
+    owner = _grow(depth.reshape(height, width), which.reshape(height, width), grow)
+    shown = owner >= 0
+    picture = np.zeros((height, width, 4), dtype=np.uint8)
+    picture[shown, :3] = rgb[owner[shown]][:, ::-1]
+    picture[shown, 3] = 255
+    return picture
 
 
-def _fill(depth: Array, colour: npt.NDArray[np.uint8]) -> None:
-    """Close holes: an empty pixel with three or more neighbours takes the nearest of them."""
-    height, width = depth.shape
-    padded = np.pad(depth, 1, constant_values=np.inf)
-    tinted = np.pad(colour, ((1, 1), (1, 1), (0, 0)))
-    best, paint = np.full_like(depth, np.inf), np.zeros_like(colour)
-    count = np.zeros(depth.shape, dtype=np.int8)
-    for dy in range(3):
-        for dx in range(3):
-            if (dy, dx) == (1, 1):
+def _grow(
+    depth: npt.NDArray[np.float32], which: npt.NDArray[np.int64], size: int
+) -> npt.NDArray[np.int64]:
+    """The point that shows in each pixel [H,W] when each covers `size` x `size`; -1 where none."""
+    for axis in (0, 1):
+        # A square is a row of columns: two passes of `size` steps instead of their product.
+        best, owner = depth.copy(), which.copy()
+        for shift in range(-(size // 2), size - size // 2):
+            if shift == 0:
                 continue
-            other = padded[dy : dy + height, dx : dx + width]
-            count += np.isfinite(other)
-            nearer = other < best
-            best[nearer] = other[nearer]
-            paint[nearer] = tinted[dy : dy + height, dx : dx + width][nearer]
-    empty = ~np.isfinite(depth) & (count >= 3)
-    depth[empty], colour[empty] = best[empty], paint[empty]
+            away = [slice(None), slice(None)]
+            here = [slice(None), slice(None)]
+            away[axis] = slice(max(-shift, 0), depth.shape[axis] - max(shift, 0))
+            here[axis] = slice(max(shift, 0), depth.shape[axis] - max(-shift, 0))
+            source, goal = tuple(away), tuple(here)
+            nearer = depth[source] < best[goal]
+            best[goal] = np.where(nearer, depth[source], best[goal])
+            owner[goal] = np.where(nearer, which[source], owner[goal])
+        depth, which = best, owner
+    return which
+
+
+def _fitting_lens(points: Array, path: Array) -> tuple[float, float, float]:
+    """f, cx, cy in pixels with which most points and the whole path fit the picture."""
+    front = points[points[:, 2] > 1e-6]
+    if not len(front):
+        return float(_SIZE[0]), _SIZE[0] / 2, _SIZE[1] / 2
+    low, high = np.percentile(front[:, :2] / front[:, 2:], [4, 96], axis=0)
+    if len(path):
+        rays = np.clip(path[:, :2] / path[:, 2:], -2.0, 2.0)
+        low, high = np.minimum(low, rays.min(axis=0)), np.maximum(high, rays.max(axis=0))
+    room = 0.94 * np.array(_SIZE) / np.maximum(high - low, 1e-6)
+    focal = float(np.clip(room.min(), 0.3 * _SIZE[0], 4.0 * _SIZE[0]))
+    cx, cy = np.array(_SIZE) / 2 - focal * (low + high) / 2
+    return focal, float(cx), float(cy)
 
 
 def _look(target: Array, distance: float, turn: float, tilt: float) -> tuple[Array, Array]:
@@ -130,17 +158,17 @@ def _look(target: Array, distance: float, turn: float, tilt: float) -> tuple[Arr
 
 
 def _draw_path(
-    picture: npt.NDArray[np.uint8], path: Array, focal: float, radius: float
+    picture: npt.NDArray[np.uint8], path: Array, lens: tuple[float, float, float], near: float
 ) -> None:
-    near = path[:, 2] > 0.02 * radius
-    if near.sum() < 1:
+    focal, cx, cy = lens
+    visible = path[path[:, 2] > near]
+    if not len(visible):
         return
-    visible = path[near]
-    x = focal * visible[:, 0] / visible[:, 2] + picture.shape[1] / 2
-    y = focal * visible[:, 1] / visible[:, 2] + picture.shape[0] / 2
+    x = focal * visible[:, 0] / visible[:, 2] + cx
+    y = focal * visible[:, 1] / visible[:, 2] + cy
     pixels = np.clip(np.stack([x, y], axis=1), -5000, 5000).round().astype(np.int32)
-    cv2.polylines(picture, [pixels.reshape(-1, 1, 2)], False, (255, 255, 255, 255), 5, cv2.LINE_AA)
-    cv2.polylines(picture, [pixels.reshape(-1, 1, 2)], False, _PATH_BGRA, 3, cv2.LINE_AA)
+    line = pixels.reshape(-1, 1, 2)
     end = (int(pixels[-1, 0]), int(pixels[-1, 1]))
-    cv2.circle(picture, end, 6, (255, 255, 255, 255), -1, cv2.LINE_AA)
-    cv2.circle(picture, end, 4, _PATH_BGRA, -1, cv2.LINE_AA)
+    for colour, width in ((_WHITE, 2), (_PATH_BGRA, 0)):
+        cv2.polylines(picture, [line], False, colour, 3 + width, cv2.LINE_AA)
+        cv2.circle(picture, end, 4 + width, colour, -1, cv2.LINE_AA)

@@ -25,18 +25,19 @@ h1{font-size:28px;line-height:1.2;margin:4px 0 6px;overflow-wrap:anywhere;letter
 h2{font-size:18px;margin:0 0 4px;letter-spacing:-.005em}
 section{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:18px 20px;
 margin-top:16px}
-.hint{color:var(--soft);font-size:13.5px;margin:0 0 12px;max-width:80ch}
-.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(158px,1fr));gap:12px}
-.tile{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:12px 16px}
+.hint{color:var(--soft);font-size:13.5px;margin:0 0 12px;max-width:110ch}
+.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(140px,1fr));gap:12px}
+.tile{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:12px 14px}
 .tile b{display:block;font-size:26px;line-height:1.25;font-weight:650;
 font-variant-numeric:tabular-nums;white-space:nowrap}
-.tile b small{font-size:15px;font-weight:500;color:var(--soft);margin-left:3px}
+.tile b small{font-size:14px;font-weight:500;color:var(--soft);margin-left:3px}
 .tile span{color:var(--soft);font-size:13px;display:block}
 .pair{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,420px),1fr));gap:16px}
 figure{margin:0;min-width:0}
 figcaption{color:var(--soft);font-size:13px;margin-top:6px}
 .plot{display:block;width:100%;height:auto;border:1px solid var(--line);border-radius:8px}
 .plot text{font:13px system-ui,-apple-system,"Segoe UI",Roboto,Arial,sans-serif}
+.chart{margin-top:16px}.chart>div{overflow-x:auto}.wide{min-width:820px}
 .note{fill:var(--soft)}.end-text{text-anchor:end}.mid-text{text-anchor:middle}
 .grid{stroke:var(--grid);fill:none;stroke-width:1}
 .bar{stroke:var(--ink);fill:none;stroke-width:1.6}

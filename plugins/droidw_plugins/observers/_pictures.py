@@ -81,7 +81,7 @@ def keyframe_pictures(
         level = _level(spread(record.uncertainty), u_low, u_high)
         # The lower end of the map is black: what is tinted should glow, not darken.
         tint = cv2.applyColorMap((90 + 165 * level).astype(np.uint8), cv2.COLORMAP_INFERNO)
-        alpha = (0.8 * (1 - weight))[..., None]
+        alpha = (0.7 * (1 - weight))[..., None]
         overlay = (image * (1 - alpha) + tint * alpha).astype(np.uint8)
 
         if record.disp_full is not None:

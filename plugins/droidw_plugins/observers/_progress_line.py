@@ -61,6 +61,7 @@ class ProgressLine:
         self._total: int | None = None
         self._keyframes = 0
         self._started = 0.0
+        self._heard = 0.0
         self._drawn = float("-inf")
         self._history: deque[tuple[float, int]] = deque()
 
@@ -82,7 +83,8 @@ class ProgressLine:
         elif isinstance(event, Progress):
             if self._stage != event.stage:
                 self._end()
-                self._begin(event.stage, event.total)
+                # Its first news come when part of it is done: it began when the last stage ended.
+                self._begin(event.stage, event.total, self._heard)
             self._advance(event.done, event.total)
         elif isinstance(event, RunWarning):
             # The log has just written the warning behind our line: start on a fresh one.
@@ -96,18 +98,19 @@ class ProgressLine:
     def _stream(self) -> TextIO:
         return self._given_stream if self._given_stream is not None else sys.stderr
 
-    def _begin(self, stage: str, total: int | None) -> None:
+    def _begin(self, stage: str, total: int | None, began: float | None = None) -> None:
         now = self._clock()
         self._stage, self._total, self._done = stage, total, 0
-        self._started = now
+        self._started = self._heard = now if began is None else began
         self._history.clear()
-        self._history.append((now, 0))
+        self._history.append((self._started, 0))
         # The live line appears at once; the first plain line after one interval.
         self._drawn = float("-inf") if self._live() else now
 
     def _advance(self, done: int, total: int | None) -> None:
         now = self._clock()
         self._done, self._total = done, total
+        self._heard = now
         self._history.append((now, done))
         while len(self._history) > 2 and now - self._history[0][0] > _WINDOW:
             self._history.popleft()
@@ -118,8 +121,7 @@ class ProgressLine:
     def _end(self, failed: bool = False) -> None:
         if not self._stage:
             return
-        now = self._clock()
-        self._draw(self._summary(now, failed), last=True)
+        self._draw(self._summary(failed), last=True)
         self._stage = ""
 
     def _line(self, now: float) -> str:
@@ -142,8 +144,8 @@ class ProgressLine:
             parts.append(f"{memory:.0f} MiB")
         return "  ".join(parts)
 
-    def _summary(self, now: float, failed: bool) -> str:
-        took = now - self._started
+    def _summary(self, failed: bool) -> str:
+        took = self._heard - self._started
         label = _LABELS.get(self._stage, self._stage)
         parts = [label + (" stopped" if failed else "")]
         if self._stage in ("tracking", "fill"):

@@ -129,10 +129,11 @@ def _tiles(result: RunResult, paths: Paths, metrics: Mapping[str, Any]) -> str:
     manifest = result.manifest
     poses = len(paths.times)
     frames = _number(manifest.get("frames"))
+    read = int(frames) if frames else len(result.trajectory)
+    keys = len(result.keyframes)
     tiles = [
-        tile(f"{int(frames) if frames else len(result.trajectory):,}", "", "frames"),
-        tile(f"{poses:,}", "", "frames with a pose"),
-        tile(f"{len(result.keyframes):,}", "", "keyframes"),
+        tile(f"{read:,}", "", "frame" if read == 1 else "frames", f"{poses:,} with a pose"),
+        tile(f"{keys:,}", "", "keyframe" if keys == 1 else "keyframes"),
     ]
     fps, memory = _number(manifest.get("fps")), _number(manifest.get("peak_memory_mb"))
     if fps is not None:
@@ -199,7 +200,7 @@ def _trajectory(paths: Paths) -> str:
         chart = error_chart(
             paths.error_times, paths.errors, rmse, paths.keyframe_times, paths.unit
         )
-        body += f'<figure style="margin-top:16px">{chart}<figcaption>Position error over time, ' \
+        body += f'<figure class="chart"><div>{chart}</div><figcaption>Position error over time, ' \
             "in seconds from the first frame; ticks mark keyframes</figcaption></figure>"
     hint = "Seen in the frame of the first camera, both axes to one scale."
     if paths.truth is not None:
@@ -235,6 +236,7 @@ def _cloud(result: RunResult, most: int) -> str:
 
 def _keyframes(result: RunResult, most: int) -> str:
     total = len(result.keyframes)
+    start = float(result.trajectory.times[0]) if len(result.trajectory) else 0.0
     pictures = keyframe_pictures(result.keyframes, result.stride, result.offset, most)
     if not pictures:
         return section("Keyframes", '<p class="hint">There is no keyframe to show.</p>')
@@ -246,8 +248,8 @@ def _keyframes(result: RunResult, most: int) -> str:
             f'<figure><div><img src="{shown.overlay}" {size} alt="keyframe {shown.number} with '
             f'uncertainty"><img src="{shown.depth}" {size} alt="depth of keyframe '
             f'{shown.number}"></div><figcaption>#{shown.number} · frame {record.index} · '
-            f"{record.time:.2f} s · {100 * shown.moving:.0f} % down-weighted · "
-            f"depth {100 * shown.depth_share:.0f} %</figcaption></figure>"
+            f"{record.time - start:.2f} s<br>{100 * shown.moving:.0f} % down-weighted · "
+            f"{100 * shown.depth_share:.0f} % with depth</figcaption></figure>"
         )
     legend = (
         '<div class="legend"><span>uncertain <i class="ramp" style="background:'
@@ -260,7 +262,8 @@ def _keyframes(result: RunResult, most: int) -> str:
         "Keyframes",
         f'{legend}<div class="keys">{"".join(cards)}</div>',
         f"{some}Left the picture, tinted where uncertainty took its weight away (it moves, or it "
-        "does not fit); right the inverse depth. Colours mean the same in all of them.",
+        "does not fit); right the inverse depth. Colours mean the same in all of them; times are "
+        "from the first frame.",
     )
 
 

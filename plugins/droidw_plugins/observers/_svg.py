@@ -144,7 +144,7 @@ def error_chart(
         size: width and height of the figure in its own units.
     """
     width, height = size
-    left, right, top, bottom = 62.0, 14.0, 22.0, 34.0
+    left, right, top, bottom = 62.0, 14.0, 34.0, 34.0
     t0, t1 = float(times.min()), float(times.max())
     if t1 <= t0:
         t1 = t0 + 1.0
@@ -196,7 +196,7 @@ def error_chart(
     y = y_of(rmse)
     parts.append(f'<path class="mean" d="M{left} {y:.1f}H{width - right}"/>')
     parts.append(
-        f'<text class="note" x="{left}" y="14">error [{escape(unit)}] of each frame, '
+        f'<text class="note" x="{left}" y="19">error [{escape(unit)}] of each frame, '
         f"dashed: RMSE {rmse:.3g} {escape(unit)}</text>"
     )
     parts.append("</svg>")

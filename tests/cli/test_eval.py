@@ -1,0 +1,173 @@
+"""`droidw eval` end to end on files."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from droidw.cli import evaluate
+from droidw.errors import DroidwError, InputError, UsageError
+
+
+def circle(count: int, scale: float = 1.0, noise: float = 0.0) -> np.ndarray:
+    """Rows t tx ty tz qx qy qz qw of a camera that goes round."""
+    s = np.linspace(0, 2 * np.pi, count)
+    rows = np.zeros((count, 8))
+    rows[:, 0] = np.arange(count) / 30.0
+    rows[:, 1], rows[:, 2], rows[:, 3] = np.cos(s), np.sin(s), 0.1 * s
+    rows[:, 1:4] = scale * rows[:, 1:4] + np.random.default_rng(0).normal(0, noise, (count, 3))
+    rows[:, 7] = 1.0
+    return rows
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> tuple[Path, Path]:
+    """A run folder and the source it was made from, with masks and uncertainty maps."""
+    source, run = tmp_path / "source", tmp_path / "run"
+    for folder in (source / "rgb", source / "mask", run / "uncertainty"):
+        folder.mkdir(parents=True)
+    np.savetxt(source / "groundtruth.txt", circle(60), header="t tx ty tz qx qy qz qw")
+    np.savetxt(run / "trajectory.tum", circle(60, 0.5, 0.005))
+    np.savetxt(run / "keyframes.tum", circle(60, 0.5, 0.005)[::6])
+    (run / "manifest.json").write_text(json.dumps({"source": str(source)}))
+    for i in range(2):
+        mask = np.zeros((48, 64), np.uint8)
+        mask[:, :24] = 255
+        cv2.imwrite(str(source / "mask" / f"{i:06d}.png"), mask)
+        u = np.full((6, 8), 900, np.uint16)
+        u[:, :3] = 30000
+        cv2.imwrite(str(run / "uncertainty" / f"{i:06d}.png"), u)
+    return run, source
+
+
+def run_eval(*words: object) -> int:
+    """The verb as the command line calls it."""
+    parser = argparse.ArgumentParser()
+    evaluate.add_arguments(parser)
+    return evaluate.main(parser.parse_args([str(word) for word in words]))
+
+
+def test_json_of_a_run_folder(places: tuple[Path, Path], capsys: pytest.CaptureFixture) -> None:
+    run, source = places
+    assert run_eval(run, "--ref", source / "groundtruth.txt", "--json") == 0
+    told = capsys.readouterr()
+    record = json.loads(told.out, parse_constant=lambda name: pytest.fail(name))
+    for key in ("ate_rmse", "ate_median", "scale", "path_length"):
+        assert isinstance(record[key], float)
+    assert (record["matched"], record["frames"]) == (60, 60)
+    assert record["scale"] == pytest.approx(2.0, rel=0.02)
+    assert 0.005 < record["ate_rmse"] < 0.03
+    assert record["align"] == "sim3" and record["unit"] == "m"
+    assert record["estimate"].endswith("trajectory.tum")
+    assert record["keyframes"]["matched"] == 10
+    assert record["masks"]["auc"] == 1.0 and record["masks"]["frames"] == 2
+    assert not (run / "metrics.json").exists()
+
+
+def test_table_of_a_run_folder(places: tuple[Path, Path], capsys: pytest.CaptureFixture) -> None:
+    run, _ = places
+    assert run_eval(run, "--delta", "0.5s") == 0
+    out = capsys.readouterr().out
+    for said in ("all frames", "keyframes", "60 / 60", "10 / 10", "ATE rmse [m]", "scale applied",
+                 "alignment sim3", "RPE over 0.5 s", "AUC 1.000"):  # fmt: skip
+        assert said in out, said
+
+
+def test_save_writes_into_the_run_folder(
+    places: tuple[Path, Path], capsys: pytest.CaptureFixture
+) -> None:
+    run, source = places
+    assert run_eval(run, "--ref", source, "--json", "--save") == 0
+    assert json.loads((run / "metrics.json").read_text()) == json.loads(capsys.readouterr().out)
+    with pytest.raises(UsageError, match="--save writes into a run folder"):
+        run_eval(run / "trajectory.tum", "--ref", source, "--save")
+
+
+def test_alignments_differ(places: tuple[Path, Path], capsys: pytest.CaptureFixture) -> None:
+    run, source = places
+    errors = {}
+    for align in ("sim3", "se3", "scale", "none"):
+        run_eval(run / "trajectory.tum", "--ref", source, "--align", align, "--json")
+        record = json.loads(capsys.readouterr().out)
+        errors[align] = record["ate_rmse"]
+        assert (record["scale"] == 1.0) == (align in ("se3", "none"))
+    assert errors["sim3"] <= min(errors.values()) and errors["se3"] <= errors["none"]
+
+
+def test_source_from_the_config(places: tuple[Path, Path], capsys: pytest.CaptureFixture) -> None:
+    run, source = places
+    (run / "manifest.json").unlink()
+    (run / "config.yaml").write_text(f"input:\n  source: tum:{source}\n")
+    assert run_eval(run, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["masks"]["frames"] == 2
+
+
+def test_bad_rows_are_left_out_and_told(
+    places: tuple[Path, Path], capsys: pytest.CaptureFixture
+) -> None:
+    run, source = places
+    truth = source / "groundtruth.txt"
+    lines = truth.read_text().splitlines()
+    lines[5] = "0.1333 nan 0 0 0 0 0 1"
+    truth.write_text("\n".join(lines) + "\n")
+    assert run_eval(run, "--ref", truth, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["ref_skipped"] == 1 and record["matched"] == 59
+    assert any("groundtruth.txt, line 6" in note for note in record["notes"])
+
+
+def refusal(*words: object) -> DroidwError:
+    with pytest.raises(DroidwError) as caught:
+        run_eval(*words)
+    return caught.value
+
+
+def test_what_is_wrong_is_said(places: tuple[Path, Path], tmp_path: Path) -> None:
+    run, source = places
+    truth = source / "groundtruth.txt"
+    cases = [
+        ((tmp_path / "nothing", "--ref", truth), 3, "there is no such file"),
+        ((tmp_path, "--ref", truth), 3, "trajectory.tum"),
+        ((run, "--ref", tmp_path / "no.txt"), 3, "no such reference file"),
+        ((run, "--ref", tmp_path), 3, "holds no groundtruth.txt"),
+        ((run, "--ref", source / "mask" / "000000.png"), 3, "not a text file"),
+        ((run, "--ref", run / "manifest.json"), 3, "line 1"),
+        ((run / "trajectory.tum",), 2, "nothing to compare with"),
+        ((run, "--ref", truth, "--t-max-diff", "-1"), 2, "time difference"),
+        ((run, "--ref", truth, "--delta", "0"), 2, "--delta"),
+        ((run / "trajectory.tum", "--ref", truth, "--masks", source / "mask"), 2, "--masks"),
+        ((run, "--ref", truth, "--masks", tmp_path / "no"), 3, "no such folder"),
+    ]
+    for words, code, said in cases:
+        error = refusal(*words)
+        assert error.exit_code == code, words
+        assert said in str(error), str(error)
+
+
+def test_frame_indices_for_stamps(places: tuple[Path, Path]) -> None:
+    run, source = places
+    rows = circle(60, 0.5)
+    rows[:, 0] = np.arange(60)
+    np.savetxt(run / "trajectory.tum", rows)
+    truth = circle(60)
+    truth[:, 0] += 1311868163.0
+    np.savetxt(source / "groundtruth.txt", truth, fmt="%.9f")
+    error = refusal(run)
+    assert isinstance(error, InputError)
+    assert "est 60 stamps 0-59 s: these look like frame indices" in error.message
+
+
+def test_few_keyframes_do_not_spoil_the_rest(
+    places: tuple[Path, Path], capsys: pytest.CaptureFixture
+) -> None:
+    run, _ = places
+    np.savetxt(run / "keyframes.tum", circle(60, 0.5)[:2])
+    assert run_eval(run, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert "keyframes" not in record
+    assert any("keyframes are not scored" in note for note in record["notes"])

@@ -1,0 +1,94 @@
+"""Matching by time stamp, and what is said when it cannot be."""
+
+import numpy as np
+import pytest
+
+from droidw.errors import InputError, UsageError
+from droidw.eval.associate import associate
+
+
+def greedy(est: np.ndarray, ref: np.ndarray, max_diff: float) -> list[tuple[int, int]]:
+    """All pairs in order of their difference, each stamp once: the slow way."""
+    pairs = sorted(
+        (abs(a - b), i, j)
+        for i, a in enumerate(est) for j, b in enumerate(ref) if abs(a - b) <= max_diff
+    )
+    used_i, used_j, out = set(), set(), []
+    for _, i, j in pairs:
+        if i not in used_i and j not in used_j:
+            used_i.add(i)
+            used_j.add(j)
+            out.append((i, j))
+    return sorted(out, key=lambda pair: est[pair[0]])
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_same_pairs_as_taking_the_closest_first(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    est, ref = rng.uniform(0, 2, 60), rng.uniform(0, 2, 90)
+    found = associate(est, ref, 0.02)
+    assert list(zip(found.est.tolist(), found.ref.tolist(), strict=True)) == greedy(est, ref, 0.02)
+
+
+def test_each_stamp_is_used_once_and_the_closest_wins() -> None:
+    found = associate(np.array([0.0, 0.009, 1.0]), np.array([0.01, 1.5]), 0.02)
+    assert found.est.tolist() == [1]
+    assert found.ref.tolist() == [0]
+    assert found.diff == pytest.approx([-0.001])
+
+
+def test_repeated_stamps_end_and_pair_up() -> None:
+    found = associate(np.zeros(5), np.zeros(3), 0.0)
+    assert len(found) == 3
+    assert len(set(found.est.tolist())) == len(set(found.ref.tolist())) == 3
+
+
+def test_offset_is_added_to_the_estimate() -> None:
+    stamps = np.arange(10.0)
+    assert len(associate(stamps, stamps + 100, 0.02, offset=100.0)) == 10
+
+
+def test_report_says_how_many() -> None:
+    text = str(associate(np.arange(4.0), np.arange(4.0) + 0.005, 0.02))
+    assert text.startswith("4 of 4 stamps matched with 4 of the reference")
+    assert "5.0 ms (allowed 20 ms)" in text
+
+
+def test_frame_indices_are_recognised() -> None:
+    ref = np.linspace(1311868163, 1311868250, 2401)
+    with pytest.raises(InputError) as caught:
+        associate(np.arange(812.0), ref)
+    assert (
+        "ref 2,401 stamps 1311868163-1311868250 s, est 812 stamps 0-811 s: "
+        "these look like frame indices" in caught.value.message
+    )
+    assert "rgb.txt" in caught.value.hint
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e9, "nano"), (1e6, "micro"), (1e3, "milli")])
+def test_other_units_are_recognised(factor: float, unit: str) -> None:
+    seconds = np.linspace(1311868163.0, 1311868250.0, 100)
+    with pytest.raises(InputError, match=f"the estimate looks like {unit}seconds"):
+        associate(seconds * factor, seconds)
+    with pytest.raises(InputError, match=f"the reference looks like {unit}seconds"):
+        associate(seconds, seconds * factor)
+
+
+def test_another_time_and_a_coarse_clock_are_told_apart() -> None:
+    with pytest.raises(InputError, match=r"they lie 41 s apart") as caught:
+        associate(np.linspace(50.5, 60.25, 30), np.linspace(0.25, 9.5, 30))
+    assert "--t-offset -50.25" in caught.value.hint
+    with pytest.raises(InputError, match=r"the nearest two are 0\.25 s apart") as caught:
+        associate(np.arange(10) * 0.6, np.arange(10) * 0.6 + 0.25)
+    assert "--t-max-diff" in caught.value.hint
+
+
+def test_nonsense_is_refused() -> None:
+    with pytest.raises(UsageError, match="from 0"):
+        associate(np.arange(3.0), np.arange(3.0), -1.0)
+    with pytest.raises(UsageError, match="finite"):
+        associate(np.arange(3.0), np.arange(3.0), 0.1, offset=float("nan"))
+    with pytest.raises(InputError, match="not a finite number"):
+        associate(np.array([0.0, np.nan]), np.arange(3.0))
+    with pytest.raises(InputError, match="est no stamps"):
+        associate(np.zeros(0), np.arange(3.0))

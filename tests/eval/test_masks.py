@@ -1,0 +1,162 @@
+"""Motion-mask scores against brute force."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from droidw.errors import InputError
+from droidw.eval.masks import (
+    find_masks,
+    read_mask,
+    resize_mask,
+    score_folder,
+    score_masks,
+)
+
+
+def brute_force(u: np.ndarray, mask: np.ndarray) -> tuple[float, float, float]:
+    """AUC over all pairs, best F1 and best IoU over all thresholds."""
+    up, down = u[mask], u[~mask]
+    wins = (up[:, None] > down[None]).sum() + 0.5 * (up[:, None] == down[None]).sum()
+    f1, iou = 0.0, 0.0
+    for threshold in np.unique(u):
+        said = u >= threshold
+        both = (said & mask).sum()
+        f1 = max(f1, 2 * both / (said.sum() + mask.sum()))
+        iou = max(iou, both / (said | mask).sum())
+    return wins / (len(up) * len(down)), f1, iou
+
+
+@pytest.mark.parametrize("levels", [2, 5, 65536])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_exact_with_and_without_ties(levels: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    maps = [rng.integers(0, levels, (9, 12)).astype(np.uint16) for _ in range(3)]
+    masks = [(m + rng.normal(0, levels / 3, m.shape)) > levels / 2 for m in maps]
+    found = score_masks(maps, masks)
+    auc, f1, iou = brute_force(np.concatenate([m.ravel() for m in maps]),
+                               np.concatenate([m.ravel() for m in masks]))
+    assert found.auc == pytest.approx(auc, rel=1e-12)
+    assert found.f1 == pytest.approx(f1, rel=1e-12)
+    assert found.iou == pytest.approx(iou, rel=1e-12)
+    said = np.concatenate([m.ravel() for m in maps]) >= found.threshold
+    truth = np.concatenate([m.ravel() for m in masks])
+    assert (said & truth).sum() / (said | truth).sum() == pytest.approx(found.iou)
+
+
+def test_by_hand() -> None:
+    u = np.array([[0.1, 0.4], [0.35, 0.8]])
+    found = score_masks([u], [np.array([[False, False], [True, True]])])
+    assert found.auc == 0.75
+    assert found.f1 == pytest.approx(0.8)
+    assert found.iou == pytest.approx(2 / 3)
+    assert found.threshold == 0.35
+    assert found.moving == 0.5
+
+
+def test_constant_uncertainty_is_chance() -> None:
+    mask = np.arange(20).reshape(4, 5) < 5
+    assert score_masks([np.ones((4, 5))], [mask]).auc == 0.5
+
+
+def test_one_kind_of_cell_only() -> None:
+    u = np.random.default_rng(0).uniform(size=(3, 3))
+    nothing = score_masks([u], [np.zeros((3, 3), bool)])
+    assert nothing.auc is nothing.f1 is nothing.iou is nothing.threshold is None
+    assert "no mask marks anything" in nothing.notes[0]
+    everything = score_masks([u], [np.ones((3, 3), bool)])
+    assert everything.auc is None and everything.f1 == 1.0
+
+
+def test_cells_that_are_not_finite_are_left_out() -> None:
+    u = np.array([[np.nan, 0.2], [0.9, np.inf]])
+    found = score_masks([u], [np.array([[True, False], [True, False]])])
+    assert found.auc == 1.0 and found.cells == 2
+    assert found.notes == ("2 of 4 cells are not finite and left out",)
+    with pytest.raises(InputError, match="no cell has a finite"):
+        score_masks([np.full((2, 2), np.nan)], [np.ones((2, 2), bool)])
+
+
+def test_shapes_are_checked() -> None:
+    with pytest.raises(InputError, match="map 0"):
+        score_masks([np.ones((2, 2))], [np.ones((2, 3), bool)])
+    with pytest.raises(InputError, match="0 uncertainty maps"):
+        score_masks([], [])
+
+
+def test_a_mask_is_reduced_by_area() -> None:
+    mask = np.zeros((16, 24), bool)
+    mask[:8, :8] = True
+    mask[8:, 16:20] = True
+    mask[8:16, 8:11] = True
+    assert resize_mask(mask, (2, 3)).tolist() == [[True, False, False], [False, False, True]]
+    assert resize_mask(mask, mask.shape).tolist() == mask.tolist()
+    wider = resize_mask(np.array([[True, False]]), (2, 4))
+    assert wider.tolist() == [[True, True, False, False]] * 2
+
+
+def folder(tmp_path: Path, names: list[str], listed: bool) -> Path:
+    """A sequence whose masks mark the left half, and run maps that find it."""
+    for sub in ("rgb", "mask", "uncertainty"):
+        (tmp_path / sub).mkdir()
+    for number, name in enumerate(names):
+        mask = np.zeros((48, 64), np.uint8)
+        mask[:, : 32 if number else 16] = 255
+        cv2.imwrite(str(tmp_path / "mask" / f"{name}.png"), mask)
+        (tmp_path / "rgb" / f"{name}.jpg").touch()
+        u = np.full((6, 8), 1000, np.uint16)
+        u[:, : 4 if number else 2] = 40000
+        cv2.imwrite(str(tmp_path / "uncertainty" / f"{number:06d}.png"), u)
+    if listed:
+        rows = "".join(f"{i / 30:.6f} rgb/{name}.jpg\n" for i, name in enumerate(names))
+        (tmp_path / "rgb.txt").write_text("# timestamp filename\n" + rows)
+    return tmp_path
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_folders_are_paired_by_frame(tmp_path: Path, listed: bool) -> None:
+    root = folder(tmp_path, ["1311.10", "1311.13", "1311.17"], listed)
+    (root / "mask" / "1311.13.png").unlink()
+    found = score_folder(root / "uncertainty", root / "mask")
+    assert (found.frames, found.without_mask) == (2, 1)
+    assert (found.auc, found.f1, found.iou) == (1.0, 1.0, 1.0)
+    assert find_masks(root / "mask").keys() == {0, 2}
+    assert found.moving == pytest.approx((0.25 + 0.5) / 2)
+
+
+def test_masks_alone_are_counted(tmp_path: Path) -> None:
+    root = folder(tmp_path, ["a", "b"], listed=False)
+    for path in (root / "rgb").iterdir():
+        path.unlink()
+    assert [find_masks(root / "mask")[i].name for i in (0, 1)] == ["a.png", "b.png"]
+
+
+def test_another_shape_is_told(tmp_path: Path) -> None:
+    root = folder(tmp_path, ["a", "b"], listed=True)
+    for path in (root / "uncertainty").iterdir():
+        cv2.imwrite(str(path), np.zeros((8, 6), np.uint16))
+    assert "of another shape" in score_folder(root / "uncertainty", root / "mask").notes[0]
+
+
+def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    root = folder(tmp_path, ["a"], listed=True)
+    with pytest.raises(InputError, match="no such folder"):
+        score_folder(root / "uncertainty", root / "nothing")
+    (root / "uncertainty" / "000000.png").rename(root / "uncertainty" / "000009.png")
+    with pytest.raises(InputError, match="no mask belongs to any of the 1"):
+        score_folder(root / "uncertainty", root / "mask")
+    (root / "uncertainty" / "000000.png").write_text("no picture")
+    with pytest.raises(InputError, match="cannot be read as a picture"):
+        score_folder(root / "uncertainty", root / "mask")
+    cv2.imwrite(str(root / "uncertainty" / "000000.png"), np.zeros((4, 4, 3), np.uint8))
+    with pytest.raises(InputError, match="colour"):
+        score_folder(root / "uncertainty", root / "mask")
+
+
+def test_masks_of_zeros_and_ones(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "m.png"), np.array([[0, 1]], np.uint8))
+    assert read_mask(tmp_path / "m.png").tolist() == [[False, True]]
