@@ -21,6 +21,7 @@ class Diagnosis:
     Attributes:
         frames: frames looked at; keyframes: keyframes kept.
         still: the camera did not move; all poses are the same.
+        unmatched: no two frames could be matched at all, so that nothing is known.
         lost: share of frames that could not be matched with the frame before at all.
         parallax: median flow due to translation between neighbouring keyframes, in cells; 0
             for a camera that only turns, NaN with fewer than two keyframes.
@@ -30,6 +31,7 @@ class Diagnosis:
     keyframes: int
     still: bool
     lost: float
+    unmatched: bool = False
     parallax: float = float("nan")
 
     def warnings(self) -> list[str]:
@@ -37,7 +39,7 @@ class Diagnosis:
         told = []
         if self.frames == 1:
             told.append("one frame only: its pose is the identity and no depth is known")
-        elif self.still:
+        elif self.still and not self.unmatched:
             told.append(
                 "the camera did not move: every pose is the same and no depth can be known"
             )
@@ -71,7 +73,8 @@ def diagnose(store: KeyframeStore, moved: Sequence[float], matched: Sequence[flo
     """
     lost = sum(share < lost_below for share in matched) / max(1, len(matched))
     return Diagnosis(
-        frames=len(moved) + 1, keyframes=len(store), still=len(store) < 2, lost=lost
+        frames=len(moved) + 1, keyframes=len(store), still=len(store) < 2, lost=lost,
+        unmatched=len(matched) > 0 and lost == 1.0,
     )
 
 

@@ -100,6 +100,16 @@ class SlamSystem:
         self._kept: dict[int, object] = {}
         self._room = config.filler.cache_mb * 1e6
 
+    @property
+    def frames(self) -> int:
+        """How many frames have been tracked."""
+        return len(self._times)
+
+    @property
+    def last_index(self) -> int:
+        """Index in the source of the frame tracked last, -1 before the first."""
+        return self._indices[-1] if self._indices else -1
+
     # -- tracking --------------------------------------------------------------------------
 
     def track(self, frames: Iterable[Frame]) -> None:

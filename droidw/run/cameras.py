@@ -1,0 +1,80 @@
+"""Which camera a run assumes, and why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from droidw.errors import InputError
+from droidw.geometry.camera import Camera
+from droidw.io.calib import read_calibration
+
+if TYPE_CHECKING:
+    from droidw.config.schema import CameraConfig
+
+__all__ = ["GUESSED_FOV", "choose_camera"]
+
+GUESSED_FOV = 60.0
+"""Horizontal field of view in degrees where nothing is known: between phones and webcams."""
+
+
+def choose_camera(
+    config: CameraConfig, known: Camera | None, width: int, height: int, source: str
+) -> tuple[Camera, str, bool]:
+    """The camera of the raw pictures.
+
+    A calibration file comes before a focal length, that before a field of view, that before
+    what the source says, and a guess comes last.
+
+    Args:
+        config: what the user said.
+        known: what the source says.
+        width, height: of the raw pictures.
+        source: name of the source, for messages.
+    Returns:
+        The camera; a sentence that says where it is from; and whether it was guessed.
+    Raises:
+        InputError: a calibration cannot be used, or does not fit the pictures.
+    """
+    given = [name for name in ("calib", "focal", "fov") if getattr(config, name) is not None]
+    if len(given) > 1:
+        raise InputError(
+            f"camera: {' and '.join(given)} are given, but only one of them can hold",
+            "give one of --calib FILE, --focal PIXELS, --fov DEGREES",
+        )
+    if config.calib is not None:
+        camera, note = read_calibration(Path(config.calib), width, height)
+        return camera, f"from {config.calib}{': ' + note if note else ''}", False
+    if config.focal is not None:
+        camera = Camera(
+            width, height, config.focal, config.focal, (width - 1) / 2, (height - 1) / 2
+        )
+        camera = camera.validated("--focal")
+        return camera, f"focal length {config.focal:g} px as given, axis in the middle", False
+    if config.fov is not None:
+        camera = Camera.guess(width, height, config.fov)
+        return camera, f"field of view {config.fov:g} degrees as given", False
+    if known is not None:
+        if (known.width, known.height) != (width, height):
+            known = _scaled(known, width, height, source)
+            return known, f"from {source}, scaled to {width}x{height}", False
+        return known.validated(source), f"from {source}", False
+    camera = Camera.guess(width, height, GUESSED_FOV)
+    said = (
+        f"unknown; a field of view of {GUESSED_FOV:g} degrees (focal length {camera.fx:.0f} px "
+        "of the raw picture) was assumed; say better with --calib FILE, --focal PIXELS or "
+        "--fov DEGREES"
+    )
+    return camera, said, True
+
+
+def _scaled(camera: Camera, width: int, height: int, source: str) -> Camera:
+    """A calibration made at another size of the same shape."""
+    across, down = width / camera.width, height / camera.height
+    if abs(across / down - 1.0) > 0.01:
+        raise InputError(
+            f"{source}: the calibration is for {camera.width}x{camera.height} px, but the "
+            f"pictures have {width}x{height} px, which is another shape",
+            f"calibrate at {width}x{height}, or give --focal PIXELS or --fov DEGREES",
+        )
+    return camera.resized(width, height).validated(source)

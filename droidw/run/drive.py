@@ -1,0 +1,381 @@
+"""Drives one run from a resolved configuration to the files of the run folder."""
+
+from __future__ import annotations
+
+import logging
+import os
+import random
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+import torch
+
+from droidw.errors import DroidwError, InputError, Interrupted, MissingRequirementError
+from droidw.errors import TrackingError
+from droidw.eval.metrics import score
+from droidw.events import Dispatcher, Progress, RunFailed, RunFinished, RunStarted
+from droidw.geometry.camera import Rectifier
+from droidw.interfaces.datasets import Selection
+from droidw.io.prefetch import prefetch
+from droidw.log import log_to_file
+from droidw.plugin.component import BuildContext
+from droidw.run.cameras import choose_camera
+from droidw.run.folder import FILES, prepare, write_json, write_text
+from droidw.run.manifest import describe_parts, peak_memory_mb, versions
+from droidw.run.signals import Stop
+from droidw.slam.frame import RunResult
+from droidw.slam.optimise import Parts
+from droidw.slam.system import Outcome, SlamSystem
+
+if TYPE_CHECKING:
+    from droidw.config.resolve import ResolvedConfig
+    from droidw.interfaces.datasets import FrameSource
+    from droidw.plugin.manager import Plugins
+    from droidw.slam.frame import Frame, RawFrame
+    from droidw.slam.timing import Stopwatch
+
+__all__ = ["run"]
+
+_log = logging.getLogger(__name__)
+
+
+def run(
+    resolved: ResolvedConfig,
+    plugins: Plugins,
+    run_dir: Path,
+    *,
+    overwrite: bool = False,
+    note: str = "",
+) -> RunResult:
+    """Run on the source that the configuration names and write the run folder.
+
+    Args:
+        resolved: configuration whose parts have been found.
+        plugins: where readers are looked up for `reader: auto`.
+        run_dir: output folder, new or empty unless `overwrite`.
+        note: a sentence for the log and the manifest, e.g. why a preset was chosen.
+    Returns:
+        What was written, as handed to the exporters.
+    Raises:
+        UsageError: the output folder cannot be used.
+        InputError: the source or the calibration cannot be used.
+        TrackingError: no frame could be matched with another.
+        MissingRequirementError: the device is not there.
+        Interrupted: stopped by a signal, after what was tracked had been written.
+    """
+    device = _device(resolved)
+    prepare(run_dir, overwrite)
+    with ExitStack() as stack:
+        stack.enter_context(log_to_file(run_dir / "log.txt"))
+        write_text(run_dir / "config.yaml", resolved.to_yaml())
+        if note:
+            _log.info(note)
+        stop = stack.enter_context(Stop())
+        return _Run(resolved, plugins, run_dir, device, stop, note).go()
+
+
+class _Run:
+    """State of one run between its stages."""
+
+    def __init__(
+        self, resolved: ResolvedConfig, plugins: Plugins, run_dir: Path,
+        device: torch.device, stop: Stop, note: str,
+    ) -> None:
+        self.resolved, self.plugins, self.run_dir = resolved, plugins, run_dir
+        self.config, self.device, self.stop, self.note = resolved.config, device, stop, note
+        self.started = time.perf_counter()
+        self.context = BuildContext(
+            device=device, seed=self.config.seed, weights_dir=plugins.weights_dir,
+            run_dir=run_dir, compat=frozenset(self.config.compat),
+        )
+        _seed(self.config.seed, self.config.threads)
+        self.events = Dispatcher(
+            [(part.name, part.factory(options, self.context)) for part, options
+             in resolved.observers]
+        )
+
+    def go(self) -> RunResult:
+        try:
+            return self._go()
+        except DroidwError as error:
+            self.events.emit(RunFailed(str(error)))
+            raise
+
+    def _go(self) -> RunResult:
+        source = self._open()
+        pictures = iter(source.frames())
+        first = next(pictures, None)
+        if first is None:
+            raise InputError(
+                f"{self.config.input.source}: no picture could be read",
+                "\n".join(source.problems[:5]) or "see: droidw run -h",
+            )
+        height, width = first.image.shape[:2]
+        camera, self.said, guessed = choose_camera(
+            self.config.camera, source.camera, width, height, source.name
+        )
+        size = self.config.camera.size
+        rectify = Rectifier(
+            camera,
+            long_side=None if size else self.config.camera.long_side,
+            size=(size[0], size[1]) if size else None,
+            edge=self.config.camera.edge,
+        )
+        if guessed:
+            self.events.warn(f"camera: {self.said}")
+        parts = self._build()
+        threads = "threads" in self.resolved.parts["correspondence"][0].capabilities
+        system = SlamSystem(
+            self.config, parts, rectify.camera, self.device, self.events, threaded=threads
+        )
+        self.built = time.perf_counter()
+
+        passes = chain([chain([first], pictures)], iter(source.frames, None))
+
+        def frames() -> Generator[Frame, None, None]:
+            return prefetch(self._prepared(next(passes), rectify, system.clock), ahead=8)
+
+        self.events.emit(
+            RunStarted(self.config.input.source, self.run_dir, source.length, self._facts())
+        )
+        failure = self._track(system, frames)
+        outcome = system.finish(frames, brief=failure is not None or self.stop.signum > 0)
+        result = self._export(system, source, outcome, rectify)
+        self._conclude(failure, result, outcome)
+        return result
+
+    @staticmethod
+    def _prepared(
+        pictures: Iterable[RawFrame], rectify: Rectifier, clock: Stopwatch
+    ) -> Iterator[Frame]:
+        """Frames at working size; what decoding takes is counted in the thread that decodes."""
+        pending = iter(pictures)
+        while True:
+            with clock("decode"):
+                raw = next(pending, None)
+                frame = None if raw is None else rectify(raw)
+            if frame is None:
+                return
+            yield frame
+
+    def _track(
+        self, system: SlamSystem, frames: Callable[[], Generator[Frame, None, None]]
+    ) -> Exception | None:
+        """Track until the end, a signal or an error; an error is kept for after the export."""
+        stream = frames()
+        try:
+            system.track(self.stop.until(stream))
+        except Exception as error:  # noqa: BLE001 - raised again once all is written
+            if not system.frames:
+                raise
+            _log.debug("tracking stopped", exc_info=True)
+            self.events.warn(f"tracking stopped after {system.frames} frames: {error}")
+            return error
+        finally:
+            stream.close()
+        return None
+
+    def _conclude(
+        self, failure: Exception | None, result: RunResult, outcome: Outcome
+    ) -> None:
+        written = f"{len(result.trajectory)} poses were written to {self.run_dir}/trajectory.tum"
+        if self.stop.signum:
+            raise Interrupted(
+                f"stopped by a signal after frame {int(result.manifest['last_frame'])}",
+                self.stop.signum, written,
+            )
+        if failure is not None:
+            raise failure
+        if outcome.diagnosis.unmatched:
+            raise TrackingError(
+                f"{self.config.input.source}: nothing could be matched between the "
+                f"{outcome.diagnosis.frames} frames: they are blank, unrelated or without texture",
+                f"{written}, all at the origin; look at the footage, or try a larger "
+                "camera.long_side",
+            )
+
+    # -- stages ----------------------------------------------------------------------------
+
+    def _open(self) -> FrameSource:
+        given = self.config.input
+        if not given.source:
+            raise InputError("no source is given", "type: droidw run SOURCE")
+        selection = Selection(given.stride, given.skip, given.max_frames)
+        if "reader" in self.resolved.parts:
+            component, options = self.resolved.parts["reader"]
+            return component.factory(options, self.context).open(given.source, selection)
+        registry = self.plugins.registry("reader")
+        for name in registry.names():
+            if registry.status(name) != "ready":
+                continue
+            component = registry.get(name)
+            reader = component.factory(component.options(), self.context)
+            if reader.recognises(given.source):
+                _log.info(f"reader: {name}")
+                return reader.open(given.source, selection)
+        what = Path(given.source)
+        found = (
+            "there is no such file or folder" if not what.exists()
+            else "no reader recognises it"
+        )
+        raise InputError(
+            f"{given.source}: {found}",
+            "a source is a folder of pictures, a video file, or reader:sequence\n"
+            f"readers: {', '.join(registry.names())}   (choose one with reader=NAME)",
+        )
+
+    def _build(self) -> Parts:
+        def part(slot: str) -> Any:
+            component, options = self.resolved.parts[slot]
+            return component.factory(options, self.context)
+
+        return Parts(
+            features=part("features"), depth=part("depth"), uncertainty=part("uncertainty"),
+            ba=part("ba"), correspondence=part("correspondence"),
+        )
+
+    def _facts(self) -> dict[str, Any]:
+        return {
+            "camera": self.said,
+            "device": str(self.device),
+            "parts": {slot: part.name for slot, (part, _) in self.resolved.parts.items()},
+        }
+
+    def _export(
+        self, system: SlamSystem, source: FrameSource, outcome: Outcome, rectify: Rectifier
+    ) -> RunResult:
+        warnings = self.events
+        for text in outcome.diagnosis.warnings():
+            warnings.warn(text)
+        for status, count in system.optimiser.reports.items():
+            warnings.warn(_REPORTS.get(status, "{count} steps: " + status).format(count=count))
+        if source.skipped:
+            shown = "; ".join(source.problems[:3])
+            warnings.warn(f"{source.skipped} pictures could not be used: {shown}")
+        elif source.problems:
+            for text in source.problems[:5]:
+                warnings.warn(text)
+        truth = source.truth
+        metrics = self._score(outcome, truth)
+        elapsed = time.perf_counter() - self.started
+        result = RunResult(
+            trajectory=outcome.trajectory,
+            keyframes=outcome.keyframes,
+            cloud=outcome.cloud,
+            camera=rectify.camera,
+            stride=system.grid.stride,
+            offset=system.grid.offset,
+            source=self.config.input.source,
+            truth=truth,
+            manifest=self._manifest(system, source, outcome, rectify, elapsed),
+            run_dir=self.run_dir,
+        )
+        if metrics is not None:
+            write_json(self.run_dir / "metrics.json", metrics)
+        total = len(self.resolved.exporters)
+        with system.clock("export"):
+            for done, (component, options) in enumerate(self.resolved.exporters):
+                try:
+                    component.factory(options, self.context).export(result, self.run_dir)
+                except (DroidwError, OSError) as error:
+                    warnings.warn(f"exporter '{component.name}' failed: {error}")
+                self.events.emit(Progress("export", done + 1, total))
+        manifest = self._manifest(
+            system, source, outcome, rectify, time.perf_counter() - self.started
+        )
+        result = replace(result, manifest=manifest, warnings=tuple(warnings.warnings))
+        write_json(self.run_dir / "manifest.json", {**manifest, "warnings": warnings.warnings})
+        self.events.emit(RunFinished(result, self.run_dir, metrics))
+        return result
+
+    def _score(self, outcome: Outcome, truth: Any) -> dict[str, Any] | None:
+        if truth is None or len(outcome.trajectory) < 3 or outcome.diagnosis.still:
+            return None
+        try:
+            return score(outcome.trajectory, truth, names=("trajectory.tum", "truth")).to_dict()
+        except DroidwError as error:
+            self.events.warn(f"the trajectory was not scored: {error.message}")
+            return None
+
+    def _manifest(
+        self, system: SlamSystem, source: FrameSource, outcome: Outcome,
+        rectify: Rectifier, elapsed: float,
+    ) -> dict[str, Any]:
+        frames = len(outcome.trajectory)
+        working = rectify.camera
+        stages = dict(system.clock.seconds)
+        stages["start"] = self.built - self.started
+        return {
+            "source": self.config.input.source,
+            "frames": frames,
+            "last_frame": system.last_index,
+            "keyframes": len(outcome.keyframes),
+            "skipped": source.skipped,
+            "problems": source.problems[:100],
+            "seconds": round(elapsed, 3),
+            "fps": round(frames / max(elapsed - (self.built - self.started), 1e-9), 2),
+            "peak_memory_mb": round(peak_memory_mb(), 1),
+            "stages": {name: round(value, 4) for name, value in stages.items()},
+            "camera": self.said,
+            "intrinsics": {
+                "width": working.width, "height": working.height,
+                "fx": working.fx, "fy": working.fy, "cx": working.cx, "cy": working.cy,
+            },
+            "scale": "metric, from the depth prior" if self._metric(system) else "arbitrary",
+            "preset": self.resolved.preset or "",
+            "note": self.note,
+            "seed": self.config.seed,
+            "device": str(self.device),
+            "versions": versions(self.device),
+            "parts": describe_parts(self.resolved),
+            "config_yaml": self.resolved.to_yaml(),
+            "files": {
+                name: meaning for name, meaning in FILES.items()
+                if (self.run_dir / name).exists() or name in ("report.html", "manifest.json")
+            },
+        }
+
+    def _metric(self, system: SlamSystem) -> bool:
+        return bool(system.parts.depth.metric)
+
+
+_REPORTS = {
+    "rejected": "{count} bundle adjustment steps were rejected, since none lowered the energy",
+    "singular": "{count} bundle adjustment steps could not be solved (singular system)",
+    "nonfinite": "{count} bundle adjustment steps were not finite and were left out",
+    "empty": "{count} bundle adjustment steps had nothing to move",
+    "dropped": "{count} measurements that were not finite were left out",
+    "uncertainty": "{count} updates of the uncertainty model were not finite",
+}
+
+
+def _device(resolved: ResolvedConfig) -> torch.device:
+    """The device of the run; `auto` takes a GPU if every part can use it."""
+    wanted = resolved.config.device
+    if wanted == "auto":
+        usable = torch.cuda.is_available() and "cuda" in resolved.devices
+        return torch.device("cuda" if usable else "cpu")
+    device = torch.device(wanted)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise MissingRequirementError(
+            f"device={wanted}: no GPU is visible to torch {torch.__version__}",
+            "run on the processor with --device cpu; see: droidw doctor",
+        )
+    return device
+
+
+def _seed(seed: int, threads: int) -> None:
+    """One seed, one order of operations: two runs give the same bytes on a CPU."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - plugins may use either generator
+    torch.manual_seed(seed)
+    torch.set_num_threads(threads or os.cpu_count() or 1)
+    # OpenCV's own threads make optical flow depend on their number; droidw runs its own.
+    cv2.setNumThreads(1)
