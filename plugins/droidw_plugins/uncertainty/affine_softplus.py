@@ -58,7 +58,7 @@ class AffineSoftplusOptions:
     )
     refresh: int = field(
         default=1,
-        metadata={"help": "similarities are computed at every n-th step on the same edges", "ge": 1},
+        metadata={"help": "similarities are renewed at every n-th step on the same edges", "ge": 1},
     )
 
 
