@@ -10,9 +10,14 @@ import logging
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 __all__ = ["log_to_file", "quiet_library", "set_up"]
+
+if TYPE_CHECKING:
+    _Stream = logging.StreamHandler[TextIO]
+else:  # generic only since Python 3.11
+    _Stream = logging.StreamHandler
 
 _ROOTS = ("droidw", "droidw_plugins")
 
@@ -27,7 +32,7 @@ class _Sentence(logging.Formatter):
         return f"droidw: {record.levelname.lower()}: {text}"
 
 
-class _Console(logging.StreamHandler[TextIO]):
+class _Console(_Stream):
     """The handler that `set_up` puts in place, recognisable so that it is never doubled."""
 
 

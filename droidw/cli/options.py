@@ -8,7 +8,19 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from droidw.plugin.manager import Plugins
 
-__all__ = ["add_plugin_arguments", "plugins_from"]
+__all__ = ["add_override_argument", "add_plugin_arguments", "plugins_from"]
+
+
+def add_override_argument(parser: argparse.ArgumentParser) -> None:
+    """`key=value ...`, anywhere among the other arguments; they end up in `args.overrides`."""
+    # without a default, argparse would call them required when something else is missing
+    parser.add_argument(
+        "overrides",
+        metavar="key=value",
+        nargs="*",
+        default=[],
+        help="set keys of the configuration, for example: camera.long_side=512 depth=none",
+    )
 
 
 def add_plugin_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,6 +13,7 @@ import droidw
 from droidw import errors
 from droidw.cli import main as cli
 from droidw.cli.main import main
+from droidw.cli.options import add_override_argument
 from droidw.cli.render import table
 from droidw.log import log_to_file
 
@@ -26,9 +27,9 @@ def verb(monkeypatch):
         module.HELP = "does as it is told"
 
         def add_arguments(parser):
-            parser.add_argument("source", nargs="?")
+            parser.add_argument("source")
             parser.add_argument("-o", "--out")
-            parser.add_argument("overrides", nargs="*")
+            add_override_argument(parser)
 
         module.add_arguments, module.main = add_arguments, action
         monkeypatch.setitem(sys.modules, module.__name__, module)
@@ -75,8 +76,14 @@ def test_unknown_verb(capsys):
 
 def test_unknown_option(verb, capsys):
     verb(lambda args: 0)
-    assert main(["act", "--colour"]) == 2
+    assert main(["act", "x", "--colour"]) == 2
     assert "droidw act: error: unrecognized arguments: --colour" in capsys.readouterr().err
+
+
+def test_what_is_missing_is_named_alone(verb, capsys):
+    verb(lambda args: 0)
+    assert main(["act", "-o", "runs/a"]) == 2
+    assert "arguments are required: source\n" in capsys.readouterr().err
 
 
 def test_overrides_may_follow_options(verb):
@@ -98,7 +105,7 @@ def test_overrides_may_follow_options(verb):
 )
 def test_known_errors_are_sentences(verb, capsys, error, code):
     verb(raising(error))
-    assert main(["act"]) == code
+    assert main(["act", "x"]) == code
     assert capsys.readouterr().err == "droidw: error: no\n  try\n  this\n"
 
 
@@ -113,7 +120,7 @@ def test_unknown_errors_keep_their_traceback(verb, capsys):
 
 def test_ctrl_c(verb, capsys):
     verb(raising(KeyboardInterrupt()))
-    assert main(["act"]) == 130
+    assert main(["act", "x"]) == 130
     assert capsys.readouterr().err == "droidw: interrupted\n"
 
 
@@ -137,9 +144,9 @@ def test_messages_by_verbosity(verb, capsys):
         "-q": "", "-v": "information\ndroidw: warning: something odd\n",
     }  # fmt: skip
     for option, text in expected.items():
-        assert main(["act", option]) == 0
+        assert main(["act", "x", option]) == 0
         assert capsys.readouterr().err == text
-    assert main(["act"]) == 0
+    assert main(["act", "x"]) == 0
     assert capsys.readouterr().err == "droidw: warning: something odd\n"
 
 

@@ -45,7 +45,8 @@ def test_an_exporter_that_is_switched_off(resolved):
 def test_round_trip(resolved, tmp_path):
     first = resolved(
         "uncertainty.options={lr: 1e-2, taps: [1, 2], path: a/b, side: right}",
-        "exporters.ply=null", "camera.size=[320, 240]", "schedule.window.updates=7", "global_solver.lm=1e-7",
+        "exporters.ply=null", "camera.size=[320, 240]", "schedule.window.updates=7",
+        "global_solver.lm=1e-7",
         "input.source='a: 1'",
     )  # fmt: skip
     path = tmp_path / "config.yaml"
