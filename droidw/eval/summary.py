@@ -120,7 +120,8 @@ class _File:
         except InputError as error:
             if not problems:
                 raise
-            raise InputError(f"{error.message}: {problems[0]}", error.hint) from error
+            first = problems[0].removesuffix("; row skipped")
+            raise InputError(f"{error.message}: {first}", error.hint) from error
         lines = path.read_text(encoding="utf-8-sig").splitlines()
         rows = sum(1 for line in lines if line.split("#", 1)[0].strip())
         return cls(path, trajectory, rows - len(trajectory), tuple(problems))
