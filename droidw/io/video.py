@@ -5,6 +5,7 @@ OpenCV's own reader is no fallback here: it sits on the same FFmpeg and knows no
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -66,7 +67,7 @@ def probe_video(path: Path) -> VideoInfo:
         if frames is None and fps and end is not None:
             frames = max(1, round((end - _start(stream)) * fps))
         aspect = stream.sample_aspect_ratio
-        for frame in _decoded(container, stream, Notes([])):
+        for frame in _Pictures(container, stream, Notes([])):
             if frame is None or frame.is_corrupt:
                 continue
             height, width = _upright(frame).shape[:2]
@@ -98,7 +99,8 @@ def decode_video(
         stream = _stream(container, path)
         step = 1.0 / float(stream.average_rate or assumed_fps)
         untimed = 0
-        for frame in _decoded(container, stream, notes):
+        pictures = _Pictures(container, stream, notes)
+        for frame in pictures:
             index += 1
             if frame is None:
                 continue  # noted already
@@ -136,7 +138,12 @@ def decode_video(
                 f"{path.name} gives no time for {untimed} pictures: "
                 f"{1 / step:g} a second assumed (reader.options.fps)"
             )
-        _note_early_end(container, stream, path, index + 1, last, step, notes)
+        due = _promised_end(container, stream)
+        if last is not None and due is not None and pictures.end + max(0.1, 3 * step) < due:
+            notes.add(
+                f"{path.name} is cut short: it should last until {due:.2f} s, but only "
+                f"{index + 1} pictures until {last:.2f} s could be read"
+            )
 
 
 def _opened(path: Path) -> InputContainer:
@@ -189,35 +196,47 @@ def _start(stream: VideoStream) -> float:
     return float((stream.start_time or 0) * _time_base(stream))
 
 
-def _decoded(
-    container: InputContainer, stream: VideoStream, notes: Notes
-) -> Iterator[VideoFrame | None]:
-    """Pictures in order of presentation; None for one that could not be decoded."""
-    for packet in _packets(container, stream, notes):
+class _Pictures:
+    """Pictures in order of presentation; None for one that could not be decoded.
+
+    Attributes:
+        end: latest time in s at which a coded picture read so far stops being shown.
+    """
+
+    def __init__(self, container: InputContainer, stream: VideoStream, notes: Notes) -> None:
+        self._container = container
+        self._stream = stream
+        self._notes = notes
+        self.end = -math.inf
+
+    def __iter__(self) -> Iterator[VideoFrame | None]:
+        for packet in self._packets():
+            at: float | None = None
+            if packet is not None and packet.pts is not None:
+                at = float(packet.pts * _time_base(self._stream))
+                shown = float((packet.duration or 0) * _time_base(self._stream))
+                self.end = max(self.end, at + shown)
+            try:
+                frames = self._stream.codec_context.decode(packet)
+            except FFmpegError as error:
+                if packet is None or packet.size == 0:
+                    continue  # nothing was left to flush
+                where = "" if at is None else f" near {at:.3f} s"
+                self._notes.skip(
+                    "pictures that cannot be decoded",
+                    f"a picture{where} cannot be decoded ({error.strerror})",
+                )
+                yield None
+                continue
+            yield from frames
+
+    def _packets(self) -> Iterator[Packet[VideoStream] | None]:
+        """Coded pictures, then an empty packet that flushes the decoder also after an error."""
         try:
-            frames = stream.codec_context.decode(packet)
+            yield from self._container.demux(self._stream)
         except FFmpegError as error:
-            if packet is None or packet.size == 0:
-                continue  # nothing was left to flush
-            where = f"near {float(packet.pts * _time_base(stream)):.3f} s" if packet.pts else ""
-            notes.skip(
-                "pictures that cannot be decoded",
-                f"a picture {where} cannot be decoded ({error.strerror})".replace("  ", " "),
-            )
+            self._notes.add(f"reading stopped early: {error.strerror}")
             yield None
-            continue
-        yield from frames
-
-
-def _packets(
-    container: InputContainer, stream: VideoStream, notes: Notes
-) -> Iterator[Packet[VideoStream] | None]:
-    """Coded pictures, then an empty packet that flushes the decoder also after an error."""
-    try:
-        yield from container.demux(stream)
-    except FFmpegError as error:
-        notes.add(f"reading stopped early: {error.strerror}")
-        yield None
 
 
 def _upright(frame: VideoFrame) -> npt.NDArray[np.uint8]:
@@ -235,21 +254,3 @@ def _promised_end(container: InputContainer, stream: VideoStream) -> float | Non
     if container.duration and len(container.streams) == 1:
         return (container.start_time or 0) / av.time_base + container.duration / av.time_base
     return None
-
-
-def _note_early_end(
-    container: InputContainer,
-    stream: VideoStream,
-    path: Path,
-    count: int,
-    last: float | None,
-    step: float,
-    notes: Notes,
-) -> None:
-    end = _promised_end(container, stream)
-    if last is None or end is None or last + max(0.1, 3 * step) >= end:
-        return
-    notes.add(
-        f"{path.name} is cut short: it should last until {end:.2f} s, but only {count} pictures "
-        f"until {last:.2f} s could be read"
-    )

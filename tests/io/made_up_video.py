@@ -19,8 +19,8 @@ def picture(i, size=SIZE):
     return image
 
 
-def write_video(path, count=40, fps=25, times=None, codec="mpeg4", size=SIZE, options=None):
-    """A video of `count` pictures at `fps`, or at these `times` in milliseconds."""
+def write_video(path, count=40, fps=25, times=None, codec="mpeg4", size=SIZE, options=None, hold=0):
+    """A video of `count` pictures at `fps`, or at these `times`; the last is held `hold` (ms)."""
     with av.open(str(path), "w", options=options or {}) as out:
         stream = out.add_stream(codec, rate=fps)
         stream.width, stream.height = size
@@ -35,7 +35,11 @@ def write_video(path, count=40, fps=25, times=None, codec="mpeg4", size=SIZE, op
             frame = av.VideoFrame.from_ndarray(picture(i, size), format="rgb24")
             if times is not None:
                 frame.pts, frame.time_base = times[i], Fraction(1, 1000)
-            out.mux(stream.encode(frame))
+            packets = stream.encode(frame)
+            if hold and i == len(times) - 1:
+                for packet in packets:
+                    packet.duration = hold
+            out.mux(packets)
         out.mux(stream.encode(None))
     return path
 

@@ -83,6 +83,14 @@ def test_a_truncated_video_gives_what_is_there_and_says_so(videos, tmp_path, suf
     assert any("a." + suffix + " is cut short" in problem for problem in problems)
 
 
+def test_a_last_picture_that_is_shown_for_long_is_no_truncation(videos, tmp_path):
+    path = videos.write_video(tmp_path / "a.mp4", times=[0, 40, 80, 5000], hold=4000)
+    frames, problems, _ = decode(path)
+    assert len(frames) == 4
+    assert problems == []
+    assert probe_video(path).frames == 4
+
+
 def test_an_mp4_without_its_index_is_told_from_no_video(videos, tmp_path):
     path = cut(videos.write_video(tmp_path / "a.mp4"), 0.5)
     with pytest.raises(InputError, match="its index is missing, so it was cut short"):
