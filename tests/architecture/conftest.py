@@ -48,7 +48,8 @@ def _parse(base: Path, package: str) -> list[Source]:
         parts = path.relative_to(base).with_suffix("").parts
         module = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
         text = path.read_text(encoding="utf-8")
-        sources.append(Source(module, path, text, ast.parse(text, filename=str(path))))
+        tree = ast.parse(text, filename=str(path), feature_version=(3, 10))
+        sources.append(Source(module, path, text, tree))
     return sources
 
 

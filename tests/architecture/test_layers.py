@@ -56,7 +56,7 @@ def test_host_layers(host):
             package, _, target = name.partition(".")
             if package != "droidw":
                 continue
-            if target == "__version__":
+            if target in ("", "__version__"):
                 continue
             if not any(_inside(target, other) for other in ALLOWED[room] | {room}):
                 wrong.append(f"{source.where}:{line}: '{room}' imports droidw.{target}")
