@@ -23,12 +23,19 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The pictures right in a folder, in natural order; hidden files are left out."""
-    found = (
-        path
-        for path in folder.iterdir()
-        if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
-    )
+    """The pictures right in a folder, in natural order; hidden files are left out.
+
+    Raises:
+        InputError: the folder cannot be listed.
+    """
+    try:
+        found = [
+            path
+            for path in folder.iterdir()
+            if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+        ]
+    except OSError as error:
+        raise InputError(f"{folder} cannot be listed: {error.strerror or error}") from error
     return sorted(found, key=lambda path: (natural_key(path.name), path.name))
 
 

@@ -25,6 +25,11 @@ def test_natural_order_and_only_pictures(tmp_path):
     assert [p.name for p in list_images(tmp_path)] == ["f1.jpg", "F2.PNG", "f9.png", "f10.png"]
 
 
+def test_a_folder_that_cannot_be_listed(tmp_path):
+    with pytest.raises(InputError, match="cannot be listed"):
+        list_images(tmp_path / "missing")
+
+
 def test_pictures_are_rgb_whatever_they_were(tmp_path):
     image = picture(tmp_path / "a.png")
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), image)
