@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import re
 import sys
+import zlib
 from collections.abc import Iterable
 from importlib import util
 from pathlib import Path
@@ -88,8 +88,8 @@ def explained(error: pluggy.PluginValidationError) -> str:
 
 def import_file(path: Path) -> ModuleType:
     """Import a Python file as a module of its own; raises whatever the file raises."""
-    digest = hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:12]
-    name = f"_droidw_plugin_{digest}_{re.sub(r'[^0-9a-zA-Z_]', '_', path.stem)}"
+    digest = zlib.crc32(str(path.resolve()).encode())
+    name = f"_droidw_plugin_{digest:08x}_{re.sub(r'[^0-9a-zA-Z_]', '_', path.stem)}"
     spec = util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} is not a Python file (its name must end in .py)")

@@ -12,9 +12,8 @@ import os
 import re
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pluggy
 
@@ -23,6 +22,9 @@ from droidw.plugin import hookspecs
 from droidw.plugin.checks import HOOKS, checked_components, explained, import_file, problem_of
 from droidw.plugin.component import Component
 from droidw.plugin.registry import KINDS, Entry, Failure, Registry, nearest
+
+if TYPE_CHECKING:
+    from importlib import metadata
 
 __all__ = ["DISABLE_VARIABLE", "GROUP", "HOST", "LOAD_VARIABLE", "Plugins", "load_plugins",
            "register"]
@@ -136,6 +138,8 @@ class Plugins:
 
     def load_entry_points(self, only: frozenset[str] | None) -> None:
         """Load what installed distributions offer; `only` limits the third-party ones."""
+        from importlib import metadata  # a tenth of a second, which `droidw -h` need not spend
+
         blocked = {_normal(name) for name in self._blocked}
         found_host = False
         points = sorted(metadata.entry_points(group=GROUP), key=lambda p: (_dist(p), p.name))
