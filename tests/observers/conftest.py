@@ -133,6 +133,12 @@ def full_manifest() -> dict:
         "stages": {"decode": 1.2, "track": 8.4, "global": 2.1, "fill": 0.9, "export": 0.3},
         "camera": "from camera.txt: 640x480, fx 525.0, no distortion; reduced to 320x240.",
         "versions": {"droidw": "0.1.0", "python": "3.12.3", "torch": "2.13.0", "numpy": "2.3.1"},
+        "seconds": 13.4,
+        "note": "preset cpu: no GPU was found",
+        "parts": {
+            "features": {"name": "cnn", "from": "droidw 0.1.0", "reference": "EfficientNet"},
+            "ba": {"name": "torch", "from": "droidw 0.1.0", "reference": "REFERENCE 3"},
+        },
         "config_yaml": "input:\n  source: /data/kitchen\ncamera:\n  long_side: 320\n" * 4,
         "files": {"trajectory.tum": "pose of every frame"},
     }

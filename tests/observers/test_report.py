@@ -98,7 +98,7 @@ def test_the_whole_page(full: RunResult, tmp_path: Path) -> None:
     for said in (
         "kitchen", "23.4", "0.0123", "0.943", "812", "Warnings (1)", "the focal length is a guess",
         "from camera.txt", "track", "8.40 s", "long_side: 320", "2.13.0", "1.5 kB",
-        "6 of 10, evenly chosen",
+        "6 of 10, evenly chosen", "EfficientNet", "no GPU was found", "13.40 s in all",
     ):  # fmt: skip
         assert said in page.text, said
     assert page.count["figure"] == 2 + 1 + 2 + 6
@@ -136,6 +136,13 @@ def test_without_truth_the_scale_is_arbitrary(make_result: Make, tmp_path: Path)
     assert "ATE" not in page.text
 
 
+def test_a_metric_depth_prior_gives_metres(make_result: Make, tmp_path: Path) -> None:
+    manifest = {"scale": "metric, from the depth prior"}
+    result = make_result(tmp_path, frames=30, keyframes=3, with_truth=False, manifest=manifest)
+    page = checked(build_page(result, tmp_path))
+    assert "arbitrary" not in page.text and "that of the depth prior" in page.text
+
+
 def test_a_still_camera_looks_still(make_result: Make, tmp_path: Path) -> None:
     result = make_result(tmp_path, frames=40, keyframes=3, with_truth=False, still=True)
     text = build_page(result, tmp_path)
@@ -164,7 +171,8 @@ def test_text_is_escaped(make_result: Make, tmp_path: Path) -> None:
 def test_a_strange_manifest_is_left_out(make_result: Make, tmp_path: Path) -> None:
     manifest = {
         "stages": {"track": float("nan"), "fill": "long", "global": -1}, "fps": float("inf"),
-        "versions": [1, 2], "files": "none", "config_yaml": None, "peak_memory_mb": True,
+        "versions": [1, 2], "parts": {"ba": "torch"}, "files": "none",
+        "config_yaml": None, "peak_memory_mb": True,
     }  # fmt: skip
     result = make_result(tmp_path, frames=5, keyframes=1, manifest=manifest)
     text = checked(build_page(result, tmp_path, {"ate_rmse": None})).text

@@ -37,7 +37,7 @@ figure{margin:0;min-width:0}
 figcaption{color:var(--soft);font-size:13px;margin-top:6px}
 .plot{display:block;width:100%;height:auto;border:1px solid var(--line);border-radius:8px}
 .plot text{font:13px system-ui,-apple-system,"Segoe UI",Roboto,Arial,sans-serif}
-.chart{margin-top:16px}.chart>div{overflow-x:auto}.wide{min-width:820px}
+.chart{margin-top:16px}.chart>div,.scroll{overflow-x:auto}.wide{min-width:820px}
 .note{fill:var(--soft)}.end-text{text-anchor:end}.mid-text{text-anchor:middle}
 .grid{stroke:var(--grid);fill:none;stroke-width:1}
 .bar{stroke:var(--ink);fill:none;stroke-width:1.6}

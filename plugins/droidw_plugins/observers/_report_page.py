@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -14,33 +12,22 @@ from droidw.events import Event, RunFinished, RunWarning
 from droidw.io.files import atomic_write
 from droidw.slam.frame import RunResult
 from droidw_plugins.observers._cloud_view import cloud_views
-from droidw_plugins.observers._html import (
-    bars,
-    definitions,
-    escape,
-    page,
-    section,
-    tile,
-)
+from droidw_plugins.observers._html import escape, page, section, tile
 from droidw_plugins.observers._pictures import colour_ramp, keyframe_pictures
+from droidw_plugins.observers._report_facts import (
+    all_metrics,
+    camera_facts,
+    configuration,
+    files,
+    number,
+    parts_used,
+    timings,
+    versions_used,
+)
 from droidw_plugins.observers._svg import Line, error_chart, nice_step, path_view
 from droidw_plugins.observers._truth import Paths, make_paths
 
 __all__ = ["Report", "build_page"]
-
-_KNOWN = {
-    "config.yaml": "the resolved configuration; droidw run takes it again",
-    "manifest.json": "versions, timings, weights, what was assumed",
-    "log.txt": "what the run said",
-    "trajectory.tum": "pose of every frame: t tx ty tz qx qy qz qw, camera to world",
-    "keyframes.tum": "poses of the keyframes, in the same format",
-    "points.ply": "static point cloud with colours",
-    "uncertainty": "what moves, frame by frame",
-    "depth": "depth maps of the keyframes",
-    "metrics.json": "errors against the truth",
-    "report.html": "this page",
-}
-
 
 class Report:
     """Writes `report.html` into the run folder when a run has finished.
@@ -105,13 +92,14 @@ def build_page(
     parts.append(_trajectory(paths))
     parts.append(_cloud(result, cloud_points))
     parts.append(_keyframes(result, keyframes))
-    parts.append(_timings(result.manifest))
-    parts.append(_camera(result))
+    parts.append(timings(result.manifest))
+    parts.append(camera_facts(result))
     if metrics:
-        parts.append(_metrics(metrics))
-    parts.append(_files(result.manifest, run_dir))
-    parts.append(_config(result.manifest))
-    parts.append(_versions(result.manifest))
+        parts.append(all_metrics(metrics))
+    parts.append(files(result.manifest, run_dir))
+    parts.append(configuration(result.manifest))
+    parts.append(parts_used(result.manifest))
+    parts.append(versions_used(result.manifest))
     parts.append("<footer>This page needs no network: everything on it is inside it.</footer>")
     return page(f"{name} · droidw", "\n".join(part for part in parts if part))
 
@@ -128,14 +116,14 @@ def _subtitle(result: RunResult, run_dir: Path) -> str:
 def _tiles(result: RunResult, paths: Paths, metrics: Mapping[str, Any]) -> str:
     manifest = result.manifest
     poses = len(paths.times)
-    frames = _number(manifest.get("frames"))
+    frames = number(manifest.get("frames"))
     read = int(frames) if frames else len(result.trajectory)
     keys = len(result.keyframes)
     tiles = [
         tile(f"{read:,}", "", "frame" if read == 1 else "frames", f"{poses:,} with a pose"),
         tile(f"{keys:,}", "", "keyframe" if keys == 1 else "keyframes"),
     ]
-    fps, memory = _number(manifest.get("fps")), _number(manifest.get("peak_memory_mb"))
+    fps, memory = number(manifest.get("fps")), number(manifest.get("peak_memory_mb"))
     if fps is not None:
         tiles.append(tile(f"{fps:.1f}", "frames/s", "whole run"))
     if memory is not None:
@@ -145,17 +133,17 @@ def _tiles(result: RunResult, paths: Paths, metrics: Mapping[str, Any]) -> str:
     else:
         tiles.append(tile(f"{paths.length / paths.depth:.3g}", "x depth", "path length",
                           "in median scene depths"))
-    ate = _number(metrics.get("ate_rmse"))
+    ate = number(metrics.get("ate_rmse"))
     unit = str(metrics.get("unit", paths.unit or "m"))
     if ate is None and len(paths.errors):
         ate = float(np.sqrt(np.mean(paths.errors**2)))
     if ate is not None:
-        percent = _number(metrics.get("ate_percent"))
+        percent = number(metrics.get("ate_percent"))
         how = str(metrics.get("align", "sim3"))
         more = f"after {how}" + (f", {percent:.1f} % of the path" if percent is not None else "")
         tiles.append(tile(f"{ate:.3g}", unit, "ATE RMSE", more))
     masks = metrics.get("masks")
-    if isinstance(masks, Mapping) and _number(masks.get("auc")) is not None:
+    if isinstance(masks, Mapping) and number(masks.get("auc")) is not None:
         tiles.append(tile(f"{masks['auc']:.3f}", "", "motion mask AUC"))
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
@@ -207,6 +195,8 @@ def _trajectory(paths: Paths) -> str:
         hint += " The truth is laid on the estimate by the best similarity (Sim(3))."
     elif paths.note:
         hint += f" {paths.note[0].upper()}{paths.note[1:]}."
+    elif paths.unit:
+        hint += " No truth is known; the scale is that of the depth prior."
     else:
         hint += " No truth is known: the scale of a single camera is arbitrary."
     return section("Trajectory", body, hint)
@@ -265,119 +255,3 @@ def _keyframes(result: RunResult, most: int) -> str:
         "does not fit); right the inverse depth. Colours mean the same in all of them; times are "
         "from the first frame.",
     )
-
-
-def _timings(manifest: Mapping[str, Any]) -> str:
-    stages = manifest.get("stages")
-    rows = [
-        (str(name), seconds)
-        for name, value in (stages.items() if isinstance(stages, Mapping) else ())
-        if (seconds := _number(value)) is not None and seconds >= 0
-    ]
-    if not rows:
-        return ""
-    total = sum(seconds for _, seconds in rows)
-    return section("Time", bars(rows, "s"), f"{total:.2f} s in all stages together.")
-
-
-def _camera(result: RunResult) -> str:
-    camera = result.camera
-    said = manifest_text(result.manifest.get("camera"))
-    rows: list[tuple[str, object]] = [
-        ("working size", f"{camera.width} x {camera.height} px"),
-        ("focal length", f"{camera.fx:.2f}, {camera.fy:.2f} px"),
-        ("principal point", f"{camera.cx:.2f}, {camera.cy:.2f} px"),
-        ("grid", f"a cell every {result.stride} px"),
-    ]
-    return section("Camera", definitions(rows), said)
-
-
-def manifest_text(value: object) -> str:
-    """A manifest entry as one line of text, "" for what is not there."""
-    if value is None:
-        return ""
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key}: {entry}" for key, entry in value.items())
-    return str(value)
-
-
-def _metrics(metrics: Mapping[str, Any]) -> str:
-    rows: list[tuple[str, object]] = []
-
-    def add(prefix: str, record: Mapping[str, Any]) -> None:
-        for key, value in record.items():
-            if isinstance(value, Mapping):
-                add(f"{prefix}{key} ", value)
-            elif isinstance(value, bool) or value is None or isinstance(value, (list, tuple)):
-                continue
-            elif isinstance(value, float):
-                rows.append((f"{prefix}{key}", f"{value:.6g}"))
-            else:
-                rows.append((f"{prefix}{key}", value))
-
-    add("", metrics)
-    return (
-        f"<section><details><summary>All figures of the evaluation</summary>"
-        f'<div style="margin-top:12px">{definitions(rows)}</div></details></section>'
-    )
-
-
-def _files(manifest: Mapping[str, Any], run_dir: Path) -> str:
-    named = manifest.get("files")
-    meaning = {str(key): str(value) for key, value in named.items()} if isinstance(
-        named, Mapping) else {}
-    there = {
-        path.name for path in run_dir.iterdir() if not path.name.startswith(".")
-    } if run_dir.is_dir() else set()
-    there.add("report.html")
-    # An entry of the manifest may name a file inside a folder, such as depth/000000.png.
-    names = sorted(there | {name for name in meaning if (run_dir / name).exists()})
-    rows = []
-    for name in names:
-        path = run_dir / name
-        about = meaning.get(name) or meaning.get(f"{name}/") or _KNOWN.get(name, "")
-        link = quote(name) + ("/" if path.is_dir() else "")
-        rows.append(
-            f'<tr><td><a href="./{escape(link)}">{escape(name)}</a></td><td>{escape(about)}</td>'
-            f"<td>{'' if name == 'report.html' else escape(_size(path))}</td></tr>"
-        )
-    return section("Files", f"<table>{''.join(rows)}</table>", str(run_dir))
-
-
-def _size(path: Path) -> str:
-    try:
-        if path.is_dir():
-            count = sum(1 for _ in path.iterdir())
-            return f"{count} file" + ("" if count == 1 else "s")
-        size = float(path.stat().st_size)
-    except OSError:
-        return ""
-    for unit in ("B", "kB", "MB"):
-        if size < 1000:
-            return f"{size:.0f} {unit}" if unit == "B" else f"{size:.1f} {unit}"
-        size /= 1000
-    return f"{size:.1f} GB"
-
-
-def _config(manifest: Mapping[str, Any]) -> str:
-    text = manifest.get("config_yaml")
-    if not text:
-        return ""
-    return (
-        "<section><details><summary>Configuration</summary>"
-        f"<pre>{escape(text)}</pre></details></section>"
-    )
-
-
-def _versions(manifest: Mapping[str, Any]) -> str:
-    versions = manifest.get("versions")
-    if not isinstance(versions, Mapping) or not versions:
-        return ""
-    rows = [(str(key), manifest_text(value)) for key, value in versions.items()]
-    return section("Versions", definitions(rows))
-
-
-def _number(value: object) -> float | None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return None
-    return float(value) if math.isfinite(value) else None

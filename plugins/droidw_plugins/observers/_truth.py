@@ -26,7 +26,7 @@ class Paths:
         keyframe_times: [K]; keyframes: [K,3] centres of the keyframes.
         truth: [M,3] reference over the time of the run, laid on the estimate; None if unknown.
         error_times, errors: [M] stamps and position errors; empty without truth.
-        unit: "m" with truth, "" where the scale is arbitrary.
+        unit: "m" with truth or a metric depth prior, "" where the scale is arbitrary.
         scale: factor from scene units to `unit`.
         depth: median depth of the scene in `unit`, or None.
         note: why there is no truth although the source has one, or "".
@@ -59,7 +59,8 @@ def make_paths(result: RunResult) -> Paths:
     keys, key_times = keys[good], key_times[good]
     if not len(poses) and len(keys):
         times, poses = key_times, keys
-    scale, unit, note = 1.0, "", ""
+    metric = str(result.manifest.get("scale", "")).startswith("metric")
+    scale, unit, note = 1.0, "m" if metric else "", ""
     truth: Array | None = None
     error_times = errors = np.zeros(0)
     if result.truth is not None and len(poses):
