@@ -1,0 +1,220 @@
+"""The prior behind `file`: finds, reads and resizes depth maps."""
+
+from __future__ import annotations
+
+import bisect
+import contextlib
+import logging
+import math
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+from zipfile import BadZipFile
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from droidw.errors import ConfigError, InputError
+from droidw.interfaces.depth import DepthMap
+from droidw_plugins.depth.file import FileDepthOptions
+
+if TYPE_CHECKING:
+    from droidw.slam.frame import Frame
+
+__all__ = ["FileDepth", "read_depth"]
+
+_SUFFIXES = (".png", ".npy", ".npz")
+_LIST = "depth.txt"
+_log = logging.getLogger(__name__)
+
+
+class FileDepth:
+    """Depth maps of a folder, found by time, by file name or by position of the frame.
+
+    A frame without a map gets none; `found` and `missing` count what was asked for.
+
+    Args:
+        options: see `FileDepthOptions`.
+    Attributes:
+        metric: as the options say.
+        available: number of maps. found, missing: frames asked for, with and without a map.
+    Raises:
+        ConfigError: no path is given, or `match="time"` without a list of times.
+        InputError: the folder is missing or holds no depth maps, or the list is broken.
+    """
+
+    def __init__(self, options: FileDepthOptions) -> None:
+        if not options.path:
+            raise ConfigError(
+                "depth.options.path: the depth prior 'file' needs a folder of depth maps",
+                "give it: depth=file depth.options.path=FOLDER",
+            )
+        self._options = options
+        self.metric = options.metric
+        path = Path(options.path).expanduser()
+        if not path.exists():
+            raise InputError(
+                f"depth.options.path: there is no folder or list {path}",
+                "give a folder of .png, .npy or .npz files, or a depth.txt",
+            )
+        folder = path if path.is_dir() else path.parent
+        listing = path / _LIST if path.is_dir() else path
+        self._times: list[float] = []
+        if listing.is_file():
+            self._times, self._files = _read_list(listing)
+        else:
+            found = (f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES)
+            self._files = sorted(found, key=_natural)
+        if not self._files:
+            raise InputError(
+                f"{folder} holds no depth maps",
+                "expected are 16-bit .png files, or .npy or .npz files with one array each",
+            )
+        if options.match == "time" and not self._times:
+            raise ConfigError(
+                f"depth.options.match: 'time' needs {folder / _LIST} with 'time file' in each line",
+                "or choose depth.options.match=name or =index",
+            )
+        self._by_stem = {file.stem: file for file in self._files}
+        self._by_number = {
+            int(file.stem): file for file in self._files if re.fullmatch(r"[0-9]+", file.stem)
+        }
+        self.available = len(self._files)
+        self.found = 0
+        self.missing = 0
+
+    def predict(self, frame: Frame) -> DepthMap | None:
+        """The depth map of a frame at the size of its image, or None where there is none.
+
+        Maps of another size are resized, each cell taking the nearest value, since averages
+        across an edge are depths that nothing has.
+
+        Raises:
+            InputError: the file exists but cannot be read as a depth map.
+        """
+        file = self._find(frame)
+        if file is None or not file.is_file():
+            self.missing += 1
+            if self.missing == 1:
+                _log.warning(
+                    "no depth map for frame %d (%s, t = %.3f s); %d maps are available in %s",
+                    frame.index, frame.name or "no name", frame.time, self.available,
+                    self._files[0].parent,
+                )
+            return None
+        self.found += 1
+        depth = read_depth(file, self._options.scale)
+        if self._options.max_depth > 0:
+            depth[depth > self._options.max_depth] = 0.0
+        height, width = frame.image.shape[-2:]
+        if depth.shape != (height, width):
+            rows = (np.arange(height) * 2 + 1) * depth.shape[0] // (2 * height)
+            columns = (np.arange(width) * 2 + 1) * depth.shape[1] // (2 * width)
+            depth = depth[rows[:, None], columns]
+        return DepthMap(torch.from_numpy(depth).to(frame.image.device))
+
+    def _find(self, frame: Frame) -> Path | None:
+        match = self._options.match
+        if match == "time" or (match == "auto" and self._times):
+            return self._nearest(frame.time)
+        if match in ("auto", "name") and frame.name:
+            file = self._by_stem.get(Path(frame.name).stem)
+            if file is not None or match == "name":
+                return file
+        if match == "name":
+            return None
+        # Numbered files keep their number, others their place in the alphabet.
+        if len(self._by_number) == len(self._files):
+            return self._by_number.get(frame.index)
+        return self._files[frame.index] if 0 <= frame.index < len(self._files) else None
+
+    def _nearest(self, time: float) -> Path | None:
+        place = bisect.bisect_left(self._times, time)
+        near = [k for k in (place - 1, place) if 0 <= k < len(self._times)]
+        best = min(near, key=lambda k: abs(self._times[k] - time))
+        if abs(self._times[best] - time) > self._options.max_time_gap:
+            return None
+        return self._files[best]
+
+
+def read_depth(file: Path, scale: float) -> npt.NDArray[np.float32]:
+    """Depth [H,W] float32 of a .png (values / scale), .npy or .npz (as they are); 0 is unknown.
+
+    Values that are negative or not finite become 0. An .npz may hold its map under "depth", or
+    must hold a single array.
+
+    Raises:
+        InputError: the file is unreadable, has more than one channel or 8-bit values.
+    """
+    values: npt.NDArray[np.generic]
+    if file.suffix.lower() == ".png":
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise InputError(f"the depth map {file} cannot be read as a picture")
+        if image.dtype != np.uint16:
+            raise InputError(
+                f"the depth map {file} has {image.dtype.itemsize * 8} bits per value",
+                "a depth .png has 16 bits and one channel; 8-bit pictures of depth are for the eye",
+            )
+        values, factor = image, 1.0 / scale
+    else:
+        values, factor = _read_array(file), 1.0
+    values = np.squeeze(values)
+    if values.ndim != 2 or values.size == 0:
+        raise InputError(
+            f"the depth map {file} has the shape {list(values.shape)}, not [height, width]"
+        )
+    depth: npt.NDArray[np.float32] = values.astype(np.float32)
+    depth *= np.float32(factor)
+    depth[~(np.isfinite(depth) & (depth > 0))] = 0.0
+    return depth
+
+
+def _read_array(file: Path) -> npt.NDArray[np.generic]:
+    try:
+        # Pickled objects could run code; a depth map never needs them.
+        loaded = np.load(file, allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            array: npt.NDArray[np.generic] = loaded
+        else:
+            with loaded:
+                names = list(loaded.files)
+                if "depth" not in names and len(names) != 1:
+                    raise InputError(
+                        f"the depth map {file} holds {len(names)} arrays ({', '.join(names)}) and "
+                        "none is called 'depth'"
+                    )
+                array = loaded["depth" if "depth" in names else names[0]]
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise InputError(f"the depth map {file} cannot be read: {error}") from error
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"the depth map {file} holds values of type {array.dtype}, not numbers")
+    return array
+
+
+def _read_list(listing: Path) -> tuple[list[float], list[Path]]:
+    """Times (ascending) and files of a depth.txt; '#' starts a comment."""
+    entries: list[tuple[float, Path]] = []
+    for number, line in enumerate(listing.read_text(errors="replace").splitlines(), start=1):
+        parts = line.split("#", 1)[0].split(maxsplit=1)
+        if not parts:
+            continue
+        time = math.nan
+        with contextlib.suppress(ValueError):
+            time = float(parts[0])
+        if len(parts) != 2 or not math.isfinite(time):
+            raise InputError(
+                f"{listing}, line {number}: '{line.strip()}' is not 'time file'",
+                "e.g. 12.033333 depth/000361.png",
+            )
+        entries.append((time, listing.parent / parts[1].strip()))
+    entries.sort(key=lambda entry: entry[0])
+    return [time for time, _ in entries], [file for _, file in entries]
+
+
+def _natural(file: Path) -> list[tuple[int, str]]:
+    """Sort key in which 9.png comes before 10.png."""
+    parts = re.split(r"([0-9]+)", file.name)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]

@@ -1,0 +1,61 @@
+"""Depth prior `file`: depth maps from a folder, one per frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+from droidw.plugin.component import BuildContext, Component
+
+if TYPE_CHECKING:
+    from droidw.interfaces.depth import DepthPrior
+
+__all__ = ["COMPONENT", "FileDepthOptions"]
+
+
+@dataclass(frozen=True)
+class FileDepthOptions:
+    """Options of the depth prior `file`."""
+
+    path: str = field(
+        default="",
+        metadata={
+            "help": "folder of depth maps (.png of 16 bit, .npy, .npz), or a list of them as "
+            "depth.txt: 'time file' in each line"
+        },
+    )
+    scale: float = field(
+        default=1000.0,
+        metadata={"help": "values of a .png per metre (1000: millimetres)", "gt": 0},
+    )
+    match: Literal["auto", "index", "name", "time"] = field(
+        default="auto",
+        metadata={
+            "help": "how maps belong to frames: time (with depth.txt), file name, or position "
+            "of the frame in the source; auto: the first of these that can apply"
+        },
+    )
+    max_time_gap: float = field(
+        default=0.02, metadata={"help": "seconds between frame and map at most", "ge": 0}
+    )
+    max_depth: float = field(
+        default=0.0, metadata={"help": "farther depths are unknown, in metres (0: keep)", "ge": 0}
+    )
+    metric: bool = field(
+        default=True, metadata={"help": "the maps are in metres, and so becomes the result"}
+    )
+
+
+def _build(options: FileDepthOptions, context: BuildContext) -> DepthPrior:
+    from droidw_plugins.depth._folder import FileDepth
+
+    return FileDepth(options)
+
+
+COMPONENT: Component[DepthPrior] = Component(
+    name="file",
+    summary="depth maps from a folder (16-bit PNG, NPY, NPZ), by time, name or position",
+    factory=_build,
+    options=FileDepthOptions,
+    capabilities=frozenset({"cpu", "cuda", "depth"}),
+)
