@@ -68,7 +68,7 @@ def umeyama(
     # Umeyama's rank test on the covariance; rounding keeps coincident points from exact zeros
     size = max(float(np.abs(source).max()), float(np.abs(target).max()), 1e-300)
     least = max(_RANK_TOLERANCE * float(D[0]), (1e-12 * size) ** 2)
-    rank = int((D > least).sum())
+    rank = int(np.count_nonzero(least < D))
     if rank == 0:
         note = "all points of one side coincide: rotation and scale cannot be told and were kept."
         return Sim3(1.0, np.eye(3), mean_target - mean_source, note)

@@ -192,7 +192,8 @@ def skew(v: Tensor) -> Tensor:
 
 def _joint_shape(a: torch.Size, b: torch.Size) -> torch.Size:
     """Shape that two leading shapes broadcast to."""
-    return torch.broadcast_shapes(a, b)
+    shape: torch.Size = torch.broadcast_shapes(a, b)  # type: ignore[no-untyped-call]
+    return shape
 
 
 def _poly(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:

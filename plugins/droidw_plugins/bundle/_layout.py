@@ -41,6 +41,9 @@ class Layout:
         ii, jj: [E] sorted.
         sources: [K] source keyframes in the order of the buckets.
         buckets: runs of sources with equal degree.
+        pair_a, pair_b: [M] all ordered pairs of edges with one source, bucket by bucket, in the
+            order (source, first edge, second edge).
+        own: [E] where in that list an edge is paired with itself.
     """
 
     order: Tensor
@@ -48,6 +51,9 @@ class Layout:
     jj: Tensor
     sources: Tensor
     buckets: tuple[Bucket, ...]
+    pair_a: Tensor
+    pair_b: Tensor
+    own: Tensor
 
 
 def make_layout(ii: Tensor, jj: Tensor) -> Layout:
@@ -55,7 +61,7 @@ def make_layout(ii: Tensor, jj: Tensor) -> Layout:
     device = ii.device
     src, dst = ii.cpu().numpy(), jj.cpu().numpy()
     if src.size == 0:
-        return Layout(ii, ii, jj, ii, ())
+        return Layout(ii, ii, jj, ii, (), ii, ii, ii)
     count = np.bincount(src)
     order = np.lexsort((dst, src, count[src]))
     src, dst = src[order], dst[order]
@@ -64,12 +70,24 @@ def make_layout(ii: Tensor, jj: Tensor) -> Layout:
     degrees = count[sources]
     buckets = []
     starts = np.flatnonzero(np.concatenate(([True], degrees[1:] != degrees[:-1])))
+    pairs: list[tuple[np.ndarray, np.ndarray]] = []
     for first, last in zip(starts, [*starts[1:], len(sources)], strict=True):
-        degree, start = int(degrees[first]), int(heads[first])
-        stop = start + degree * int(last - first)
-        buckets.append(Bucket(start, stop, int(first), int(last), degree))
-    move = [torch.from_numpy(a).to(device) for a in (order, src, dst, sources)]
-    return Layout(move[0], move[1], move[2], move[3], tuple(buckets))
+        degree, start, n = int(degrees[first]), int(heads[first]), int(last - first)
+        buckets.append(Bucket(start, start + degree * n, int(first), int(last), degree))
+        edges = start + np.arange(degree * n).reshape(n, degree)
+        shape = (n, degree, degree)
+        pairs.append(
+            (
+                np.broadcast_to(edges[:, :, None], shape).ravel(),
+                np.broadcast_to(edges[:, None, :], shape).ravel(),
+            )
+        )
+    pair_a, pair_b = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    own = np.flatnonzero(pair_a == pair_b)
+    move = [
+        torch.from_numpy(a).to(device) for a in (order, src, dst, sources, pair_a, pair_b, own)
+    ]
+    return Layout(move[0], move[1], move[2], move[3], tuple(buckets), *move[4:])
 
 
 class Workspace:

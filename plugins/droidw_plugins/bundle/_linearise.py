@@ -25,9 +25,10 @@ __all__ = ["SIGNS", "EdgeSums", "energy", "linearise"]
 SIGNS = (1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
 """What the six pose components of every sum are multiplied by, once per component."""
 
-# Rows of the u and v parts: five pose components that are not 0, J_z, residual.
+# Which components the rows of the u and v parts are: five of the pose that are not 0, J_z,
+# residual. The order lets one pass over both parts fill a row.
 _U_ROWS = (0, 2, 3, 4, 5, 6, 7)
-_V_ROWS = (1, 2, 3, 4, 5, 6, 7)
+_V_ROWS = (1, 2, 4, 3, 5, 6, 7)
 
 
 @dataclass(frozen=True)
@@ -53,8 +54,8 @@ class _Chunk:
 
     part: slice
     d: Tensor  # [n,P] disparity in the source
-    a: Tensor  # [n,P] X / Z
-    b: Tensor  # [n,P] Y / Z
+    ab: Tensor  # [n,2,P] X / Z, Y / Z
+    ba: Tensor  # [n,2,P] Y / Z, X / Z
     inv_z: Tensor  # [n,P] 1 / Z, with Z clamped to NEAR
     ok: Tensor  # [n,P] 1 where Z >= NEAR
     weight: Tensor  # [n,P,2]
@@ -76,7 +77,7 @@ def linearise(
     """
     like = problem.disps
     n_edges, n_cells = layout.ii.shape[0], like.shape[-2] * like.shape[-1]
-    fx, fy, _, _ = problem.intrinsics.tolist()
+    focal = problem.intrinsics[:2, None].to(like.dtype)
     gram = torch.zeros(n_edges, 8, 8, dtype=torch.float64, device=like.device)
     coupling = depth = None
     if not problem.motion_only:
@@ -91,7 +92,7 @@ def linearise(
     for c in _project(problem, layout, problem.T_cw, problem.disps, work, chunk, G):
         n = c.d.shape[0]
         rows = work.take("rows", n, 2, 7, n_cells, like=like)
-        _weighted_rows(c, t[c.part], fx, fy, problem.huber, rows, work, problem.motion_only)
+        _weighted_rows(c, t[c.part], focal, problem.huber, rows, work, problem.motion_only)
         flat = rows.view(2 * n, 7, n_cells)
         products = torch.bmm(flat, flat.transpose(1, 2)).view(n, 2, 7, 7).double()
         out = gram[c.part]
@@ -157,7 +158,11 @@ def _project(
     if G is None:
         T64 = T_cw.double()
         G = se3.mul(T64[layout.jj], se3.inv(T64[layout.ii]))
-    R, t = se3.rotation(G).to(like.dtype), G[:, :3].to(like.dtype)
+    # the second coordinate twice: (Y, X, Y, Z) holds both (X, Y) and (Y, X) as runs of planes
+    twice = torch.tensor((1, 0, 1, 2), device=like.device)
+    R = se3.rotation(G)[:, twice].to(like.dtype)
+    t = G[:, twice].to(like.dtype)
+    focal, centre = problem.intrinsics.to(like.dtype)[:, None].split(2)
     rays = torch.ones(3, n_cells, dtype=like.dtype, device=like.device)
     xy = pixel_grid(h, w, like.dtype, like.device).view(-1, 2)
     torch.div(xy[:, 0] - cx, fx, out=rays[0])
@@ -176,34 +181,35 @@ def _project(
         torch.index_select(targets, 0, index, out=target)
         weight = work.take("weight", n, 2 * n_cells, like=like)
         torch.index_select(weights, 0, index, out=weight)
-        points = work.take("points", n, 3, n_cells, like=like)
+        points = work.take("points", n, 4, n_cells, like=like)
         torch.mm(R[part].reshape(-1, 3), rays, out=points.view(-1, n_cells))
         points.addcmul_(t[part, :, None], d[:, None])
-        a, b, Z = points.unbind(1)
+        Z = points[:, 3]
         ok = work.take("ok", n, n_cells, like=like)
         torch.ge(Z, NEAR, out=ok)
         inv_z = Z.clamp_(min=NEAR).reciprocal_()
-        points[:, :2] *= inv_z[:, None]
+        points[:, :3] *= inv_z[:, None]
+        ba, ab = points[:, :2], points[:, 1:3]
         r = work.take("residual", n, 2, n_cells, like=like)
-        target = target.view(n, n_cells, 2)
-        torch.add(target[..., 0], a, alpha=-fx, out=r[:, 0])
-        torch.add(target[..., 1], b, alpha=-fy, out=r[:, 1])
-        r[:, 0] -= cx
-        r[:, 1] -= cy
-        yield _Chunk(part, d, a, b, inv_z, ok, weight.view(n, n_cells, 2), r)
+        torch.addcmul(target.view(n, n_cells, 2).transpose(1, 2), ab, focal, value=-1.0, out=r)
+        r -= centre
+        yield _Chunk(part, d, ab, ba, inv_z, ok, weight.view(n, n_cells, 2), r)
 
 
 def _weighted_rows(
     c: _Chunk,
     t: Tensor,
-    fx: float,
-    fy: float,
+    focal: Tensor,
     huber: float | None,
     rows: Tensor,
     work: Workspace,
     motion_only: bool,
 ) -> None:
-    """Fills rows [n,2,7,P] with sqrt(W) times the Jacobian and the residual (REFERENCE 2.3)."""
+    """Fills rows [n,2,7,P] with sqrt(W) times the Jacobian and the residual (REFERENCE 2.3).
+
+    Per part and in this order, with h the disparity in j: (h, ah, ab, 1+a^2, b, J_z, r) for u and
+    (h, bh, ab, 1+b^2, a, J_z, r) for v, all but r times the focal length.
+    """
     n, n_cells = c.d.shape
     root = work.take("root", n, 2, n_cells, like=c.d)
     torch.mul(c.weight.transpose(1, 2), c.ok[:, None], out=root)
@@ -213,43 +219,34 @@ def _weighted_rows(
         root *= (huber / length.clamp_(min=huber)).unsqueeze(1)
     root.sqrt_()
     torch.mul(root, c.r, out=rows[:, :, 6])
-    root[:, 0] *= fx
-    root[:, 1] *= fy
-    e = work.take("e", n, n_cells, like=c.d)
-    torch.mul(c.d, c.inv_z, out=e)
-    u, v, su, sv = rows[:, 0], rows[:, 1], root[:, 0], root[:, 1]
-    torch.mul(root, e[:, None], out=rows[:, :, 0])
-    torch.mul(u[:, 0], c.a, out=u[:, 1])
-    torch.mul(v[:, 0], c.b, out=v[:, 1])
-    torch.mul(su, c.b, out=u[:, 4])
-    torch.mul(sv, c.a, out=v[:, 4])
-    torch.mul(u[:, 4], c.a, out=u[:, 2])
-    torch.mul(v[:, 4], c.b, out=v[:, 3])
-    torch.mul(su, c.a, out=e)
-    torch.addcmul(su, c.a, e, out=u[:, 3])
-    torch.mul(sv, c.b, out=e)
-    torch.addcmul(sv, c.b, e, out=v[:, 2])
+    root *= focal
+    h = c.d.mul_(c.inv_z)
+    both = torch.mul(root, c.ab, out=c.r)  # the residual is in its row: its planes are free
+    torch.mul(root, h[:, None], out=rows[:, :, 0])
+    torch.mul(rows[:, :, 0], c.ab, out=rows[:, :, 1])
+    torch.mul(both, c.ba, out=rows[:, :, 2])
+    torch.addcmul(root, both, c.ab, out=rows[:, :, 3])
+    torch.mul(root, c.ba, out=rows[:, :, 4])
     if motion_only:
         rows[:, :, 5] = 0.0
         return
     # J_z: (t_x - t_z a) / Z and (t_y - t_z b) / Z
-    tz = t[:, 2:]
     root *= c.inv_z[:, None]
-    torch.addcmul(t[:, :1], c.a, tz, value=-1.0, out=e)
-    torch.mul(su, e, out=u[:, 5])
-    torch.addcmul(t[:, 1:2], c.b, tz, value=-1.0, out=e)
-    torch.mul(sv, e, out=v[:, 5])
+    torch.addcmul(t[:, :2, None], c.ab, t[:, 2:, None], value=-1.0, out=both)
+    torch.mul(root, both, out=rows[:, :, 5])
 
 
 def _depth_products(rows: Tensor, coupling: Tensor, depth: Tensor) -> None:
     """W J_z J_j into coupling [n,6,P]; W J_z^2 and W J_z r into depth [n,2,P]."""
     u, v = rows[:, 0], rows[:, 1]
-    ju, jv = u[:, 5:6], v[:, 5:6]
-    torch.mul(u[:, 0], u[:, 5], out=coupling[:, 0])
-    torch.mul(v[:, 0], v[:, 5], out=coupling[:, 1])
-    torch.mul(u[:, 1:4], ju, out=coupling[:, 2:5])
-    coupling[:, 2:5].addcmul_(v[:, 1:4], jv)
-    torch.mul(v[:, 4], v[:, 5], out=coupling[:, 5])
-    coupling[:, 5].addcmul_(u[:, 4], u[:, 5], value=-1.0)
-    torch.mul(u[:, 5:7], ju, out=depth)
-    depth.addcmul_(v[:, 5:7], jv)
+    ju, jv = u[:, 5], v[:, 5]
+    torch.mul(u[:, 0], ju, out=coupling[:, 0])
+    torch.mul(v[:, 0], jv, out=coupling[:, 1])
+    torch.mul(u[:, 1:5], ju[:, None], out=coupling[:, 2:])
+    coupling[:, 2].addcmul_(v[:, 1], jv)
+    coupling[:, 3].addcmul_(v[:, 3], jv)
+    coupling[:, 4].addcmul_(v[:, 2], jv)
+    # the one sign that differs between u and v
+    coupling[:, 5].neg_().addcmul_(v[:, 4], jv)
+    torch.mul(u[:, 5:], ju[:, None], out=depth)
+    depth.addcmul_(v[:, 5:], jv[:, None])

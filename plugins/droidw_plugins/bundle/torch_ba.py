@@ -19,7 +19,7 @@ class TorchBundleOptions:
     """Options of the `torch` backend."""
 
     chunk_cells: int = field(
-        default=49152,
+        default=98304,
         metadata={"help": "cells worked on at a time; fewer need less memory and cache", "ge": 1},
     )
     halvings: int = field(
