@@ -125,7 +125,7 @@ def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
             getattr(config, section)[name] = _plain(options)
             listed[section].append((part, options))
     if problems:
-        raise _joined(problems)
+        raise _joined(problems, loaded)
     devices = _check_fit(config, parts, loaded)
     return ResolvedConfig(
         config, parts, tuple(listed["exporters"]), tuple(listed["observers"]), devices,
@@ -174,12 +174,14 @@ def _options(
     return options
 
 
-def _joined(problems: Sequence[DroidwError]) -> DroidwError:
+def _joined(problems: Sequence[DroidwError], loaded: LoadedConfig) -> DroidwError:
     """One error for all parts that are missing: nobody wants to learn of them one by one."""
     first, *others = problems
-    if not others:
-        return first
     hint = first.hint + "".join(f"\nalso: {other.message}" for other in others)
+    if loaded.preset and f"{loaded.preset}.yaml:" in first.message.partition(": ")[0] + ":":
+        hint += (
+            f"\npreset '{loaded.preset}' names these parts; --preset auto takes what can run here"
+        )
     return type(first)(first.message, hint)
 
 

@@ -185,6 +185,7 @@ def test_preset_paper_names_each_part_that_is_missing(resolved):
         resolved(preset="paper")
     text = str(caught.value)
     assert "configs/presets/paper.yaml:" in text.splitlines()[0]
+    assert text.endswith("preset 'paper' names these parts; --preset auto takes what can run here")
     for name in ("fit3d", "metric3d", "droid"):
         assert f"is called '{name}'" in text
 
