@@ -120,14 +120,14 @@ def definitions(rows: Iterable[tuple[str, object]]) -> str:
     ) + "</dl>"
 
 
-def bars(rows: Iterable[tuple[str, float]], unit: str) -> str:
-    """Horizontal bars of non-negative values with their share of the sum."""
+def bars(rows: Iterable[tuple[str, float]], unit: str, whole: float) -> str:
+    """Horizontal bars of non-negative values with their share of `whole`."""
     values = list(rows)
     most = max((value for _, value in values), default=0.0) or 1.0
-    total = sum(value for _, value in values) or 1.0
+    whole = whole or 1.0
     cells = "".join(
         f'<span>{escape(name)}</span><i style="width:{max(0.0, 100 * value / most):.1f}%"></i>'
-        f"<em>{value:.2f} {escape(unit)} · {100 * value / total:.0f} %</em>"
+        f"<em>{value:.2f} {escape(unit)} · {100 * value / whole:.0f} %</em>"
         for name, value in values
     )
     return f'<div class="bars">{cells}</div>'

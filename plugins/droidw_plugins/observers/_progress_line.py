@@ -26,6 +26,7 @@ __all__ = ["ProgressLine", "memory_mib"]
 _LABELS = {"global": "global bundle adjustment", "fill": "poses of all frames", "export": "export"}
 _REFRESH = 0.1
 _WINDOW = 5.0
+_EVENTS = 30
 _BAR = 20
 
 
@@ -112,7 +113,8 @@ class ProgressLine:
         self._done, self._total = done, total
         self._heard = now
         self._history.append((now, done))
-        while len(self._history) > 2 and now - self._history[0][0] > _WINDOW:
+        # At least some events: a keyframe takes long, and one alone would tell a wrong speed.
+        while len(self._history) > _EVENTS and now - self._history[0][0] > _WINDOW:
             self._history.popleft()
         if now - self._drawn >= (_REFRESH if self._live() else self._interval):
             self._drawn = now
@@ -137,8 +139,9 @@ class ProgressLine:
         speed = (self._done - count) / (now - since) if now > since else 0.0
         if self._stage in ("tracking", "fill") and speed > 0:
             parts.append(f"{speed:.1f} frames/s")
-        if not unknown and speed > 0 and self._total and self._total > self._done:
-            parts.append(f"{_clock_text((self._total - self._done) / speed)} left")
+        if self._total and self._total > self._done > 0:
+            pace = (now - self._started) / self._done
+            parts.append(f"{_clock_text((self._total - self._done) * pace)} left")
         memory = self._memory()
         if memory is not None:
             parts.append(f"{memory:.0f} MiB")

@@ -48,9 +48,13 @@ def timings(manifest: Mapping[str, Any]) -> str:
     if not rows:
         return ""
     total = sum(seconds for _, seconds in rows)
-    hint = f"{total:.2f} s in all stages together"
     whole = number(manifest.get("seconds"))
-    return section("Time", bars(rows, "s"), hint + (f"; {whole:.2f} s in all." if whole else "."))
+    if whole is None or whole <= 0:
+        return section("Time", bars(rows, "s", total), f"{total:.2f} s in all stages together.")
+    hint = f"{whole:.2f} s in all."
+    if total > whole:
+        hint += " Some of these lie within others, so they add up to more."
+    return section("Time", bars(rows, "s", whole), hint)
 
 
 def camera_facts(result: RunResult) -> str:

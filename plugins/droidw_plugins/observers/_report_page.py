@@ -106,10 +106,10 @@ def build_page(
 
 def _subtitle(result: RunResult, run_dir: Path) -> str:
     parts = [result.source]
-    for key in ("preset", "device", "started"):
+    for key, word in (("preset", "preset "), ("device", "on "), ("started", "")):
         value = result.manifest.get(key)
         if isinstance(value, str) and value:
-            parts.append(value)
+            parts.append(word + value)
     return " · ".join(part for part in (*parts, str(run_dir)) if part)
 
 
@@ -154,11 +154,9 @@ def _trajectory(paths: Paths) -> str:
     span = float(np.ptp(paths.centres, axis=0).max())
     least = 0.02 * paths.depth if paths.depth else 0.0
     length = nice_step(max(span, least, 1e-9), 3)
-    label = f"{length:g} {paths.unit or 'units'}"
-    if not paths.unit:
-        label += ", scale arbitrary"
-        if paths.depth:
-            label += f" ({100 * length / paths.depth:.2g} % of the median depth)"
+    label = f"{length:g} {paths.unit}" if paths.unit else f"{length:g}, scale arbitrary"
+    if paths.depth and not paths.unit:
+        label += f" ({100 * length / paths.depth:.2g} % of depth)"
     views = []
     for title, axes, up, names in (
         ("from above", (0, 2), 1.0, ("right", "forward")),
@@ -198,7 +196,8 @@ def _trajectory(paths: Paths) -> str:
     elif paths.unit:
         hint += " No truth is known; the scale is that of the depth prior."
     else:
-        hint += " No truth is known: the scale of a single camera is arbitrary."
+        hint += " No truth is known: the scale of a single camera is arbitrary, so the bar is also "
+        hint += "given as a share of the median depth of the scene."
     return section("Trajectory", body, hint)
 
 

@@ -98,7 +98,7 @@ def path_view(
     parts += [
         f'<path class="bar" d="M{margin} {y - 4}v8M{margin} {y}h{length:.2f}m0 -4v8"/>',
         f'<text class="note" x="{margin + length + 10:.1f}" y="{y + 4}">{escape(bar[1])}</text>',
-        f'<text class="note end-text" x="{width - 10}" y="{height - foot - 8:.0f}">'
+        f'<text class="note end-text" x="{width - 10}" y="{y + 4}">'
         f"{escape(axes[0])} →</text>",
         f'<text class="note" x="10" y="18">↑ {escape(axes[1])}</text>',
         "</svg>",
