@@ -48,7 +48,7 @@ def test_part_keeps_the_contract_of_its_kind(entry, device, tmp_path):
     options = None
     if (entry.kind, entry.component.name) == ("depth", "file"):
         Scene(SceneSpec(width=96, height=72, frames=1)).write(tmp_path)
-        options = entry.component.options(folder=str(tmp_path / "depth"))
+        options = entry.component.options(path=str(tmp_path / "depth"))
     check(entry.kind, entry.component, device, options)
 
 
