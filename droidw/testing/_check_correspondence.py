@@ -37,6 +37,7 @@ def correspondence(subject: Subject) -> None:
     scene = Scene(SceneSpec())
     pictures = [scene.render(k) for k in _INDICES]
     for rows, columns in _CROPS:
+        part = subject.build(seed=3)  # an operator serves one run, whose pictures have one size
         frames = []
         for picture in pictures:
             image = torch.from_numpy(picture.image[:rows, :columns].copy())
