@@ -17,7 +17,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from droidw.geometry import projective, se3
 from droidw.solve.problem import BAProblem, Report, Step

@@ -78,7 +78,7 @@ def reproject(
     # K R K^-1 [x y 1] + d K t: pixels go straight to (u Z, v Z, Z)
     KR = (K @ se3.rotation(G) @ K_inv).to(disps.dtype)
     Kt = (G[:, :3] @ K.T).to(disps.dtype)
-    points = _transform(KR, Kt, _homogeneous(h, w, disps), disps.flatten(1)[ii])
+    points = _transform(KR, Kt, _homogeneous(h, w, disps), disps.flatten(1).index_select(0, ii))
     Z = points[:, 2]
     uv = points[:, :2] / Z.clamp_min(NEAR)[:, None]
     coords = uv.transpose(1, 2).contiguous().view(n_edges, h, w, 2)
@@ -148,10 +148,10 @@ def frame_distance(
     step = max(1, _CHUNK_CELLS // (h * w))
     for start in range(0, ii.shape[0], step):
         part = slice(start, min(start + step, ii.shape[0]))
-        d = flat[ii[part]]
+        d = flat.index_select(0, ii[part])
         full = _transform(KR[part], Kt[part], pixels, d)
         f1, m1 = _masked_flow(full, pixels)
-        shifted = torch.baddbmm(pixels.expand_as(full), Kt[part, :, None], d[:, None])
+        shifted = torch.addcmul(pixels, Kt[part, :, None], d[:, None])
         f2, m2 = _masked_flow(shifted, pixels)
         share = (beta * m1 + (1.0 - beta) * m2) / (h * w)
         mean = (beta * f1 + (1.0 - beta) * f2) / (h * w) / share.clamp_min(_MIN_SHARE)
@@ -162,11 +162,12 @@ def frame_distance(
 def _masked_flow(points: Tensor, pixels: Tensor) -> tuple[Tensor, Tensor]:
     """Sum of the flow length over usable cells [E] and their number [E]; overwrites points."""
     uv, Z = points[:, :2], points[:, 2]
-    usable = (Z > NEAR).to(points.dtype)
-    uv /= Z.clamp_(min=NEAR)[:, None]
+    usable = torch.gt(Z, NEAR, out=torch.empty_like(Z))
+    uv *= Z.clamp_(min=NEAR).reciprocal_()[:, None]
     uv -= pixels[:2]
-    length = torch.hypot(uv[:, 0], uv[:, 1])
-    return torch.linalg.vecdot(length, usable), usable.sum(-1)
+    uv *= uv
+    length = torch.add(uv[:, 0], uv[:, 1], out=uv[:, 0]).sqrt_()
+    return length.mul_(usable).sum(-1), usable.sum(-1)
 
 
 def _camera_matrices(intrinsics: Tensor) -> tuple[Tensor, Tensor]:
@@ -185,6 +186,6 @@ def _homogeneous(h: int, w: int, like: Tensor) -> Tensor:
 
 
 def _transform(R: Tensor, t: Tensor, rays: Tensor, d: Tensor) -> Tensor:
-    """R [E,3,3] rays [3,P] + d [E,P] t [E,3] for every edge, [E, 3, P]: two matrix products."""
+    """R [E,3,3] rays [3,P] + d [E,P] t [E,3] for every edge, [E, 3, P]."""
     turned = (R.reshape(-1, 3) @ rays).view(R.shape[0], 3, rays.shape[1])
-    return torch.baddbmm(turned, t[:, :, None], d[:, None])
+    return turned.addcmul_(t[:, :, None], d[:, None])

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from droidw.geometry import projective, se3
+from droidw.geometry import se3
 from droidw.geometry.align import umeyama
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster, TorchBundleOptions
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from droidw.geometry import se3
 from droidw.solve.problem import BAProblem, Report, Step
 from droidw_plugins.bundle._layout import Layout, Workspace, make_layout
-from droidw_plugins.bundle._linearise import EdgeSums, energy, linearise
+from droidw_plugins.bundle._linearise import EdgeSums, edge_motions, energy, linearise
 from droidw_plugins.bundle._schur import back_substitute, reduce_system, solve_reduced
 
 __all__ = ["gauss_newton_step"]
@@ -33,14 +33,14 @@ def gauss_newton_step(problem: BAProblem, work: Workspace, chunk: int, halvings:
     """
     layout = make_layout(problem.ii, problem.jj)
     T64 = problem.T_cw.double()
-    G = se3.mul(T64[layout.jj], se3.inv(T64[layout.ii]))
+    motions = edge_motions(problem.T_cw, layout)
     # the sums hold the energy at the start, but neither a robust one nor one to compare with
     separate = problem.guard or problem.huber is not None
-    sums = linearise(problem, layout, G, work, chunk, separate)
+    sums = linearise(problem, layout, motions, work, chunk, separate)
     dropped = 0
     if not bool(torch.isfinite(sums.gram).all()):
         problem, dropped = _without_nonfinite(problem)
-        sums = linearise(problem, layout, G, work, chunk, separate)
+        sums = linearise(problem, layout, motions, work, chunk, separate)
         if not bool(torch.isfinite(sums.gram).all()):
             return _unchanged(problem, Report("nonfinite", math.nan, dropped=dropped))
 
@@ -57,7 +57,7 @@ def gauss_newton_step(problem: BAProblem, work: Workspace, chunk: int, halvings:
     n_free = free.shape[0]
     slots = torch.full_like(problem.fixed, n_free, dtype=torch.int64)
     slots[free] = torch.arange(n_free, device=free.device)
-    adjoints = se3.adjoint(G)
+    adjoints = motions.adjoints()
     S, g, depth = reduce_system(problem, layout, sums, adjoints, slots, n_free, work)
     dx = torch.zeros(problem.T_cw.shape[0], 6, dtype=torch.float64, device=S.device)
     if n_free:

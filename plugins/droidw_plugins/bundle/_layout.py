@@ -84,9 +84,7 @@ def make_layout(ii: Tensor, jj: Tensor) -> Layout:
         )
     pair_a, pair_b = (np.concatenate(side) for side in zip(*pairs, strict=True))
     own = np.flatnonzero(pair_a == pair_b)
-    move = [
-        torch.from_numpy(a).to(device) for a in (order, src, dst, sources, pair_a, pair_b, own)
-    ]
+    move = [torch.from_numpy(a).to(device) for a in (order, src, dst, sources, pair_a, pair_b, own)]
     return Layout(move[0], move[1], move[2], move[3], tuple(buckets), *move[4:])
 
 

@@ -20,7 +20,7 @@ from droidw.geometry.projective import NEAR, pixel_grid
 from droidw.solve.problem import BAProblem
 from droidw_plugins.bundle._layout import Layout, Workspace
 
-__all__ = ["SIGNS", "EdgeSums", "energy", "linearise"]
+__all__ = ["SIGNS", "EdgeMotions", "EdgeSums", "edge_motions", "energy", "linearise"]
 
 SIGNS = (1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
 """What the six pose components of every sum are multiplied by, once per component."""
@@ -29,6 +29,30 @@ SIGNS = (1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
 # residual. The order lets one pass over both parts fill a row.
 _U_ROWS = (0, 2, 3, 4, 5, 6, 7)
 _V_ROWS = (1, 2, 4, 3, 5, 6, 7)
+
+
+@dataclass(frozen=True)
+class EdgeMotions:
+    """Relative motions G_ij of the sorted edges: R [E,3,3] and t [E,3] in float64."""
+
+    R: Tensor
+    t: Tensor
+
+    def adjoints(self) -> Tensor:
+        """Ad(G_ij), [E,6,6]."""
+        Ad = self.R.new_zeros(self.R.shape[0], 6, 6)
+        Ad[:, :3, :3] = self.R
+        Ad[:, 3:, 3:] = self.R
+        torch.bmm(se3.skew(self.t), self.R, out=Ad[:, :3, 3:])
+        return Ad
+
+
+def edge_motions(T_cw: Tensor, layout: Layout) -> EdgeMotions:
+    """G_ij = T_j T_i^-1 of the sorted edges for poses [N,7], with unit quaternions restored."""
+    T = se3.normalise(T_cw.double())
+    R, t = se3.rotation(T), T[:, :3]
+    R_ij = torch.bmm(R[layout.jj], R[layout.ii].transpose(1, 2))
+    return EdgeMotions(R_ij, t[layout.jj] - torch.bmm(R_ij, t[layout.ii, :, None])[..., 0])
 
 
 @dataclass(frozen=True)
@@ -63,14 +87,19 @@ class _Chunk:
 
 
 def linearise(
-    problem: BAProblem, layout: Layout, G: Tensor, work: Workspace, chunk: int, keep_valid: bool
+    problem: BAProblem,
+    layout: Layout,
+    motions: EdgeMotions,
+    work: Workspace,
+    chunk: int,
+    keep_valid: bool,
 ) -> EdgeSums:
     """Normal equations of every edge.
 
     Args:
         problem: its target and weight should be finite; if not, `gram` is not finite either.
         layout: order of the edges.
-        G: [E,7] float64 relative poses of the sorted edges.
+        motions: of the sorted edges, at the poses of the problem.
         work: scratch space; `coupling`, `depth` and `valid` live in it.
         chunk: cells worked on at a time.
         keep_valid: fill `valid`.
@@ -88,8 +117,8 @@ def linearise(
     v_rows = torch.tensor(_V_ROWS, device=like.device)
     u_signs = torch.ones(7, dtype=torch.float64, device=like.device)
     u_signs[4] = -1.0
-    t = G[:, :3].to(like.dtype)
-    for c in _project(problem, layout, problem.T_cw, problem.disps, work, chunk, G):
+    t = motions.t.to(like.dtype)
+    for c in _project(problem, layout, motions, problem.disps, work, chunk):
         n = c.d.shape[0]
         rows = work.take("rows", n, 2, 7, n_cells, like=like)
         _weighted_rows(c, t[c.part], focal, problem.huber, rows, work, problem.motion_only)
@@ -121,7 +150,8 @@ def energy(
     gained by pushing points behind a camera.
     """
     total = torch.zeros((), dtype=torch.float64, device=disps.device)
-    for c in _project(problem, layout, T_cw, disps, work, chunk, None):
+    motions = edge_motions(T_cw, layout)
+    for c in _project(problem, layout, motions, disps, work, chunk):
         weight = c.weight.transpose(1, 2) * valid[c.part].unsqueeze(1)
         cells = (weight * c.r * c.r).sum(1)
         if problem.huber is not None:
@@ -144,25 +174,21 @@ def _length(cells: Tensor, weight: Tensor) -> Tensor:
 def _project(
     problem: BAProblem,
     layout: Layout,
-    T_cw: Tensor,
+    motions: EdgeMotions,
     disps: Tensor,
     work: Workspace,
     chunk: int,
-    G: Tensor | None,
 ) -> Iterator[_Chunk]:
     """Projects the cells of every edge, a run of edges at a time, into reused buffers."""
     like = problem.disps
     h, w = like.shape[-2:]
     n_edges, n_cells = layout.ii.shape[0], h * w
     fx, fy, cx, cy = problem.intrinsics.tolist()
-    if G is None:
-        T64 = T_cw.double()
-        G = se3.mul(T64[layout.jj], se3.inv(T64[layout.ii]))
     # the second coordinate twice: (Y, X, Y, Z) holds both (X, Y) and (Y, X) as runs of planes
     twice = torch.tensor((1, 0, 1, 2), device=like.device)
-    R = se3.rotation(G)[:, twice].to(like.dtype)
-    t = G[:, twice].to(like.dtype)
-    focal, centre = problem.intrinsics.to(like.dtype)[:, None].split(2)
+    R, t = motions.R[:, twice].to(like.dtype), motions.t[:, twice].to(like.dtype)
+    intrinsics = problem.intrinsics.to(like.dtype)[:, None]
+    focal, centre = intrinsics[:2], intrinsics[2:]
     rays = torch.ones(3, n_cells, dtype=like.dtype, device=like.device)
     xy = pixel_grid(h, w, like.dtype, like.device).view(-1, 2)
     torch.div(xy[:, 0] - cx, fx, out=rays[0])
