@@ -226,3 +226,9 @@ def test_none_trusts_everything() -> None:
     assert model.update(view).energy == 0.0
     assert float(view.uncertainty.abs().max()) == 0.0
     model.load_state_dict(model.state_dict())
+
+
+def test_start_without_noise_trusts_every_cell_alike() -> None:
+    model = _model(init_scale=0.0)
+    view = _started(model)
+    assert torch.allclose(view.uncertainty, torch.tensor(0.74194), atol=1e-5)

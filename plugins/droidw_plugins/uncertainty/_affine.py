@@ -151,7 +151,7 @@ class AffineSoftplus:
         self._theta = state["theta"].clone().to(self._device) if state else None
 
     def _parameters(self, channels: int) -> Tensor:
-        """theta, made at the first call: weights from N(0, 1/C), bias 0."""
+        """theta, made at the first call: weights from N(0, 1/C) times `init_scale`, bias 0."""
         if channels == 0:
             raise ConfigError(
                 "uncertainty.name: 'affine-softplus' needs features, but the feature extractor "
@@ -159,7 +159,8 @@ class AffineSoftplus:
                 "choose an extractor, e.g. features=cnn, or switch both off: uncertainty=none",
             )
         if self._theta is None:
-            weights = torch.randn(channels, generator=self._generator) / channels**0.5
+            weights = torch.randn(channels, generator=self._generator)
+            weights *= self._options.init_scale / channels**0.5
             self._theta = torch.cat([weights, torch.zeros(1)]).to(self._device)
         elif self._theta.numel() != channels + 1:
             raise ConfigError(

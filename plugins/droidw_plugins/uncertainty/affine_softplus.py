@@ -35,6 +35,14 @@ class AffineSoftplusOptions:
     bias: bool = field(
         default=True, metadata={"help": "learn a bias (the paper's form has none)"}
     )
+    init_scale: float = field(
+        default=1.0,
+        metadata={
+            "help": "factor on the random start of the weights, N(0, 1/C); 0 starts all cells at "
+            "the same u, below the gate",
+            "ge": 0,
+        },
+    )
     min_gap: int = field(
         default=2, metadata={"help": "keyframes between the ends of an edge that counts", "ge": 1}
     )
