@@ -17,7 +17,9 @@ __all__ = ["droidw_exporters"]
 @hookimpl
 def droidw_exporters() -> Iterable[Component[Exporter]]:
     """Light records only: the factory of each imports what it needs."""
-    from droidw_plugins.exporters import ply, trajectory
+    from droidw_plugins.exporters import depth, ply, trajectory, uncertainty
 
+    yield depth.COMPONENT
     yield ply.COMPONENT
     yield trajectory.COMPONENT
+    yield uncertainty.COMPONENT
