@@ -190,7 +190,8 @@ class DroidwConfig:
     ba: SlotConfig = field(default_factory=lambda: SlotConfig("torch"))
     correspondence: SlotConfig = field(default_factory=lambda: SlotConfig("flow"))
     exporters: dict[str, Any] = opt(
-        {"trajectory": {}, "ply": {}}, "exporter name -> its options; null switches one off"
+        {"trajectory": {}, "ply": {}, "uncertainty": {}, "depth": {}},
+        "exporter name -> its options; null switches one off",
     )
     observers: dict[str, Any] = opt(
         {"progress": {}, "report": {}}, "observer name -> its options; null switches one off"
