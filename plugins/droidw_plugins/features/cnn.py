@@ -52,7 +52,7 @@ class CnnOptions:
         },
     )
     constant: float = field(
-        default=0.7,
+        default=1.0,
         metadata={
             "help": "a channel of this value beside features of length about 1; raises cosines",
             "ge": 0,
