@@ -43,8 +43,10 @@ def main(args: argparse.Namespace) -> int:
     plugins = plugins_from(args)
     result = execute(
         plugins, [], "cpu",
-        [f"input.source='{footage}'", f"seed={args.seed}", "exporters.uncertainty={}"],
-        run_dir, overwrite=run_dir.exists(),
+        [f"seed={args.seed}"],
+        run_dir,
+        values={"input.source": str(footage)},
+        overwrite=run_dir.exists(),
     )
     print(summary(result))
     scores = evaluate(run_dir, footage / "groundtruth.txt")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from droidw.cli.options import add_plugin_arguments, plugins_from
 from droidw.errors import UsageError
@@ -50,7 +51,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 _FLAGS = {
-    "calib": "camera.calib",
     "focal": "camera.focal",
     "fov": "camera.fov",
     "stride": "input.stride",
@@ -69,17 +69,17 @@ def main(args: argparse.Namespace) -> int:
         DroidwError: as `droidw.run.run`.
     """
     source, overrides = _split(args.items)
-    for flag, key in _FLAGS.items():
-        value = getattr(args, flag)
-        if value is not None:
-            # JSON quotes keep a path with spaces or a colon in one piece.
-            overrides.insert(0, f"{key}={value}" if flag != "calib" else f"{key}='{value}'")
-    if source is not None:
-        overrides.insert(0, f"input.source='{source}'")
-    plugins = plugins_from(args)
+    values = {} if source is None else {"input.source": source}
+    if args.calib is not None:
+        values["camera.calib"] = args.calib
+    flags = [
+        f"{key}={getattr(args, flag)}"
+        for flag, key in _FLAGS.items()
+        if getattr(args, flag) is not None
+    ]
     result = execute(
-        plugins, [Path(f) for f in args.config], args.preset, overrides,
-        Path(args.output) if args.output else None, overwrite=args.overwrite,
+        plugins_from(args), [Path(f) for f in args.config], args.preset, flags + overrides,
+        Path(args.output) if args.output else None, values=values, overwrite=args.overwrite,
     )
     print(summary(result))
     return 0
@@ -92,6 +92,7 @@ def execute(
     overrides: list[str],
     run_dir: Path | None,
     *,
+    values: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> RunResult:
     """Resolve a configuration and run it; `run_dir` None means a new folder below runs/."""
@@ -101,7 +102,7 @@ def execute(
     note = ""
     if preset == "auto" or (preset is None and not files):
         preset, note = choose_preset(plugins)
-    resolved = resolve(load_config(files, preset, overrides), plugins)
+    resolved = resolve(load_config(files, preset, overrides, values), plugins)
     source = resolved.config.input.source
     if not source:
         raise UsageError("no SOURCE is given", "type: droidw run SOURCE [-o RUNDIR]")
