@@ -96,7 +96,7 @@ def test_json(run, acme):
         "help": "factor on all features",
     }  # fmt: skip
     defaults = [p["name"] for p in facts["plugins"] if p["default"] and p["kind"] == "exporter"]
-    assert defaults == ["ply", "trajectory"]
+    assert defaults == ["depth", "ply", "trajectory", "uncertainty"]
     assert "acme-depth" in [failure["name"] for failure in facts["failures"]]
     assert json.loads(run("--json", "--options", "acme"))[0]["name"] == "acme"
 

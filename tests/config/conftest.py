@@ -81,6 +81,8 @@ def plugins():
         ("reader", part("odd", OddOptions)),
         ("exporter", part("trajectory")),
         ("exporter", part("ply", TextOptions)),
+        ("exporter", part("uncertainty")),
+        ("exporter", part("depth")),
         ("observer", part("progress")),
         ("observer", part("report")),
     ]:

@@ -120,7 +120,9 @@ def test_overrides_choose_before_they_set():
 def test_exporters_add_up_and_can_be_switched_off(write):
     mine = write("mine.yaml", "exporters: {colmap: {}, ply: null}\n")
     loaded = load_config([mine], overrides=["exporters.csv={}"])
-    assert loaded.data["exporters"] == {"trajectory": {}, "ply": None, "colmap": {}, "csv": {}}
+    assert loaded.data["exporters"] == {
+        "trajectory": {}, "ply": None, "uncertainty": {}, "depth": {}, "colmap": {}, "csv": {},
+    }  # fmt: skip
     assert load_config(overrides=["exporters=[ply]"]).data["exporters"] == {"ply": {}}
 
 

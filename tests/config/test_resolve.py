@@ -20,7 +20,8 @@ from droidw.plugin.registry import PluginNotFound
 def test_defaults_resolve(resolved):
     done = resolved()
     assert set(done.parts) == {"features", "depth", "uncertainty", "ba", "correspondence"}
-    assert [part.name for part, _ in done.exporters] == ["trajectory", "ply"]
+    names = [part.name for part, _ in done.exporters]
+    assert names == ["trajectory", "ply", "uncertainty", "depth"]
     assert [part.name for part, _ in done.observers] == ["progress", "report"]
     assert done.devices == {"cpu"}  # `flow` of these tests knows no other
     assert isinstance(done.config, DroidwConfig)
@@ -38,7 +39,7 @@ def test_options_are_frozen_dataclasses_of_their_part(resolved):
 
 def test_an_exporter_that_is_switched_off(resolved):
     done = resolved("exporters.ply=null", "observers=[report]")
-    assert [part.name for part, _ in done.exporters] == ["trajectory"]
+    assert [part.name for part, _ in done.exporters] == ["trajectory", "uncertainty", "depth"]
     assert [part.name for part, _ in done.observers] == ["report"]
 
 
@@ -54,7 +55,7 @@ def test_round_trip(resolved, tmp_path):
     second = resolved(files=[path])
     assert second.config == first.config
     assert second.parts == first.parts
-    assert [part.name for part, _ in second.exporters] == ["trajectory"]
+    assert [part.name for part, _ in second.exporters] == ["trajectory", "uncertainty", "depth"]
     assert second.to_yaml() == first.to_yaml()
     assert yaml.safe_load(first.to_yaml())["uncertainty"]["options"]["taps"] == [1, 2]
     assert "# ba: torch, from registered from Python" in first.to_yaml()
