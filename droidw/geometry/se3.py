@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 if TYPE_CHECKING:
@@ -192,8 +193,8 @@ def skew(v: Tensor) -> Tensor:
 
 def _joint_shape(a: torch.Size, b: torch.Size) -> torch.Size:
     """Shape that two leading shapes broadcast to."""
-    shape: torch.Size = torch.broadcast_shapes(a, b)  # type: ignore[no-untyped-call]
-    return shape
+    # torch.broadcast_shapes would do, but its first call imports sympy: 0.7 s.
+    return torch.Size(np.broadcast_shapes(tuple(a), tuple(b)))
 
 
 def _poly(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:

@@ -7,14 +7,13 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate, Motion, Purpose
 
@@ -29,14 +28,18 @@ Array = npt.NDArray[np.float32]
 _FULL_FIELDS = 24
 # Grid flows kept for the filler: some ten kilobytes each.
 _GRID_FIELDS = 20_000
+# Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
+_FLAT = 0.1
+# Checked pairs kept for the next session that asks for them: some forty kilobytes each.
+_PAIRS = 4_000
 
 
 @dataclass(frozen=True)
 class FlowFrame:
     """Payload of one frame: grey image [H,W] uint8 and texture [h,w,2] at the cells.
 
-    `texture` is the root mean square image derivative along x and along y, in grey levels per
-    pixel, over the neighbourhood of a cell.
+    `texture` is the root mean square image derivative that fixes a match along x and along y,
+    in grey levels per pixel, over the neighbourhood of a cell.
     """
 
     index: int
@@ -69,6 +72,7 @@ class FlowCorrespondence:
         self._lock = threading.Lock()
         self._full: OrderedDict[tuple[int, int], Array] = OrderedDict()
         self._grid: OrderedDict[tuple[int, int], tuple[Array, Array]] = OrderedDict()
+        self._pairs: OrderedDict[tuple[int, int], tuple[_Edge, _Edge]] = OrderedDict()
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
         """Grey image and texture at the cells."""
@@ -77,13 +81,19 @@ class FlowCorrespondence:
         centres = grid.centres().numpy().astype(np.float32)
         window = (2 * self.stride - 1, 2 * self.stride - 1)
         scaled = grey * np.float32(255.0)
-        texture = []
-        for dx, dy in ((1, 0), (0, 1)):
-            slope = cv2.Scharr(scaled, cv2.CV_32F, dx, dy, scale=1 / 32)
-            energy = cv2.blur(slope * slope, window, borderType=cv2.BORDER_REPLICATE)
-            texture.append(np.sqrt(np.maximum(_at(energy, centres), 0.0)))
+        dx = cv2.Scharr(scaled, cv2.CV_32F, 1, 0, scale=1 / 32)
+        dy = cv2.Scharr(scaled, cv2.CV_32F, 0, 1, scale=1 / 32)
+        xx, yy, xy = (
+            _at(cv2.blur(p, window, borderType=cv2.BORDER_REPLICATE), centres)
+            for p in (dx * dx, dy * dy, dx * dy)
+        )
+        # What the window says of x once y is free, and the other way round: an oblique edge,
+        # along which a match may slide, then counts for little in both.
+        alone_x = xx - xy * xy / (yy + _FLAT)
+        alone_y = yy - xy * xy / (xx + _FLAT)
+        texture = np.sqrt(np.maximum(np.stack([alone_x, alone_y], -1), 0.0))
         grey8 = np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
-        return FlowFrame(frame.index, grey8, np.stack(texture, -1), centres, self.stride)
+        return FlowFrame(frame.index, grey8, texture, centres, self.stride)
 
     def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:
         """Nothing more is needed of a keyframe."""
@@ -97,7 +107,7 @@ class FlowCorrespondence:
 
     def session(self, purpose: Purpose = "window") -> _FlowSession:
         """Fresh edge state; flows already measured are shared between sessions."""
-        return _FlowSession(self, one_way=purpose == "fill")
+        return _FlowSession(self, one_way=purpose == "fill", guided=purpose == "global")
 
     # -- measuring -------------------------------------------------------------------------
 
@@ -184,7 +194,16 @@ class FlowCorrespondence:
     def both_ways(
         self, a: FlowFrame, b: FlowFrame, start_ab: Array | None, start_ba: Array | None
     ) -> tuple[_Edge, _Edge]:
-        """Edges a -> b and b -> a, each checked against the other."""
+        """Edges a -> b and b -> a, each checked against the other.
+
+        Without a start the answer of an earlier session is as good as a new one.
+        """
+        key = (a.index, b.index)
+        if start_ab is None and start_ba is None:
+            with self._lock:
+                known = self._pairs.get(key)
+            if known is not None:
+                return replace(known[0]), replace(known[1])
         if start_ab is None:
             ab = self._forward(a, b)
         else:
@@ -193,7 +212,12 @@ class FlowCorrespondence:
             ba = self._forward(b, a)
         else:
             ba = self._search(b, a, self._dense(start_ba, b))
-        return self._checked(a, ab, ba, start_ab), self._checked(b, ba, ab, start_ba)
+        both = self._checked(a, ab, ba, start_ab), self._checked(b, ba, ab, start_ba)
+        with self._lock:
+            self._pairs[key] = both
+            while len(self._pairs) > _PAIRS:
+                self._pairs.popitem(last=False)
+        return replace(both[0]), replace(both[1])
 
     def _dense(self, target: Array, a: FlowFrame) -> Array:
         """Grid targets [h,w,2] in cells as a full flow field [H,W,2] in pixels."""
@@ -236,9 +260,10 @@ class FlowCorrespondence:
 class _FlowSession:
     """Edges measured once, and again when geometry says that the search went elsewhere."""
 
-    def __init__(self, owner: FlowCorrespondence, *, one_way: bool) -> None:
+    def __init__(self, owner: FlowCorrespondence, *, one_way: bool, guided: bool) -> None:
         self._owner = owner
         self._one_way = one_way
+        self._guided = guided
         self._edges: dict[int, _Edge] = {}
 
     def forget(self, ids: list[int]) -> None:
@@ -249,31 +274,38 @@ class _FlowSession:
     def update(self, request: EdgeRequest) -> EdgeUpdate:
         """Measure what is new or has moved away; return the state of all edges."""
         coords = request.coords.detach().cpu().numpy()
-        wanted = [
-            row
-            for row, edge_id in enumerate(request.ids)
-            if edge_id not in self._edges or self._astray(self._edges[edge_id], coords[row], request)
-        ]
+        new = [row for row, edge_id in enumerate(request.ids) if edge_id not in self._edges]
+        wanted = sorted(new + self._astray(request, coords))
         if self._one_way:
             self._measure_one_way(request, wanted)
         else:
             self._measure_pairs(request, wanted, coords)
+        if not request.ids:
+            return EdgeUpdate(torch.zeros_like(request.coords), torch.zeros_like(request.coords))
         edges = [self._edges[edge_id] for edge_id in request.ids]
         device = request.coords.device
         target = torch.from_numpy(np.stack([e.target for e in edges])).to(device)
         confidence = torch.from_numpy(np.stack([e.confidence for e in edges])).to(device)
         return EdgeUpdate(target, confidence)
 
-    def _astray(self, edge: _Edge, coords: Array, request: EdgeRequest) -> bool:
-        """Whether most confident cells lie far from the prediction of good geometry."""
+    def _astray(self, request: EdgeRequest, coords: Array) -> list[int]:
+        """Rows where most confident cells lie far from the prediction of good geometry."""
         opt = self._owner.options
-        if self._one_way or not request.informed or edge.searches > opt.restarts:
-            return False
-        sure = edge.confidence.max(axis=-1) > 0.1
-        if sure.mean() < 0.02:
-            return True
-        away = np.abs(coords - edge.target).max(axis=-1)
-        return bool(np.median(away[sure]) > opt.restart)
+        if self._one_way or not request.informed:
+            return []
+        rows = [
+            row
+            for row, edge_id in enumerate(request.ids)
+            if edge_id in self._edges and self._edges[edge_id].searches <= opt.restarts
+        ]
+        if not rows:
+            return []
+        edges = [self._edges[request.ids[row]] for row in rows]
+        sure = np.stack([e.confidence.max(axis=-1) for e in edges]) > 0.1
+        away = np.abs(coords[rows] - np.stack([e.target for e in edges])).max(axis=-1)
+        known = sure.mean(axis=(1, 2))
+        far = ((away > opt.restart) & sure).mean(axis=(1, 2))
+        return [row for row, k, f in zip(rows, known, far, strict=True) if k < 0.02 or f > k / 2]
 
     def _measure_one_way(self, request: EdgeRequest, wanted: list[int]) -> None:
         def job(row: int) -> Callable[[], _Edge]:
@@ -291,7 +323,10 @@ class _FlowSession:
             pairs.setdefault((min(i, j), max(i, j)), {})[i < j] = row
 
         def start(row: int | None) -> Array | None:
+            # In the window the first search is free: the newest pose is what it has to find.
             if row is None or not request.informed:
+                return None
+            if not self._guided and request.ids[row] not in self._edges:
                 return None
             valid = request.valid[row].cpu().numpy()
             return coords[row] if valid.mean() > 0.5 else None
@@ -322,9 +357,3 @@ def _at(values: Any, points: Array, outside: float | None = None) -> Array:
         borderValue=(outside or 0.0,) * 4,
     )
     return sampled.astype(np.float32, copy=False)
-
-
-def as_numpy(values: Tensor) -> Array:
-    """A float32 array of a tensor, for OpenCV."""
-    array: Array = values.detach().cpu().numpy().astype(np.float32, copy=False)
-    return array
