@@ -16,7 +16,10 @@ HELP = "render a short scene with exact truth, run on it, and evaluate the run"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `droidw demo`."""
     parser.add_argument(
-        "-o", "--output", metavar="DIR", default="runs/demo",
+        "-o",
+        "--output",
+        metavar="DIR",
+        default="runs/demo",
         help="folder for the footage (DIR/footage) and the run (DIR/run); default runs/demo",
     )
     parser.add_argument("--frames", type=int, default=90, help="frames to render (90)")
@@ -42,7 +45,9 @@ def main(args: argparse.Namespace) -> int:
     Scene(SceneSpec(frames=args.frames, seed=args.seed)).write(footage)
     plugins = plugins_from(args)
     result = execute(
-        plugins, [], "cpu",
+        plugins,
+        [],
+        "cpu",
         [f"seed={args.seed}"],
         run_dir,
         values={"input.source": str(footage)},

@@ -103,8 +103,12 @@ def _listing(plugins: Plugins, entries: list[Entry]) -> str:
         text.append(
             table(
                 [
-                    (f.name, f.origin, " ".join(f.error.split()) + (
-                        f"  (--traceback {f.name})" if f.traceback else ""))
+                    (
+                        f.name,
+                        f.origin,
+                        " ".join(f.error.split())
+                        + (f"  (--traceback {f.name})" if f.traceback else ""),
+                    )
                     for f in plugins.failures
                 ],
                 indent=2,
@@ -113,8 +117,10 @@ def _listing(plugins: Plugins, entries: list[Entry]) -> str:
     packages = len({e.distribution for e in entries})
     count = f"{len(entries)} part{'s' * (len(entries) != 1)}"
     origin = f"{packages} package{'s' * (packages != 1)}"
-    text += ["", f"* default.  {count} from {origin}.  Options of one: droidw list-plugins "
-                 "--options NAME"]
+    text += [
+        "",
+        f"* default.  {count} from {origin}.  Options of one: droidw list-plugins --options NAME",
+    ]
     return "\n".join(text)
 
 
@@ -159,8 +165,10 @@ def _options(plugins: Plugins, entry: Entry) -> str:
 
     component = entry.component
     status = plugins.registry(entry.kind).status(component.name)
-    text = [f"{KINDS[entry.kind].noun} {component.name}   {status}   {entry.origin}",
-            paragraph(f"  {component.summary}", indent=2)]
+    text = [
+        f"{KINDS[entry.kind].noun} {component.name}   {status}   {entry.origin}",
+        paragraph(f"  {component.summary}", indent=2),
+    ]
     if component.reference:
         text.append(paragraph(f"  {component.reference}", indent=2))
     options = _option_rows(entry)
@@ -203,6 +211,4 @@ def _traceback(plugins: Plugins, name: str) -> str:
             f"--traceback: no plugin called '{name}' failed to load",
             f"failed: {', '.join(names)}" if names else "every plugin was loaded",
         )
-    return "\n".join(
-        f"{f.name} ({f.origin}): {f.error}\n{f.traceback}".rstrip() for f in found
-    )
+    return "\n".join(f"{f.name} ({f.origin}): {f.error}\n{f.traceback}".rstrip() for f in found)

@@ -116,9 +116,7 @@ def _dispatch(arguments: list[str]) -> int:
 
 def _verb_position(arguments: Sequence[str]) -> int:
     """Index of the first argument that is no option; no general option takes a value."""
-    return next(
-        (k for k, text in enumerate(arguments) if not text.startswith("-")), len(arguments)
-    )
+    return next((k for k, text in enumerate(arguments) if not text.startswith("-")), len(arguments))
 
 
 def _top_parser() -> argparse.ArgumentParser:

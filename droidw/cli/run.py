@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from droidw.cli.options import add_plugin_arguments, plugins_from
@@ -78,8 +78,13 @@ def main(args: argparse.Namespace) -> int:
         if getattr(args, flag) is not None
     ]
     result = execute(
-        plugins_from(args), [Path(f) for f in args.config], args.preset, flags + overrides,
-        Path(args.output) if args.output else None, values=values, overwrite=args.overwrite,
+        plugins_from(args),
+        [Path(f) for f in args.config],
+        args.preset,
+        flags + overrides,
+        Path(args.output) if args.output else None,
+        values=values,
+        overwrite=args.overwrite,
     )
     print(summary(result))
     return 0
@@ -108,9 +113,7 @@ def execute(
         raise UsageError("no SOURCE is given", "type: droidw run SOURCE [-o RUNDIR]")
     from droidw.run import run
 
-    return run(
-        resolved, plugins, run_dir or _fresh(source), overwrite=overwrite, note=note
-    )
+    return run(resolved, plugins, run_dir or _fresh(source), overwrite=overwrite, note=note)
 
 
 def _split(items: list[str]) -> tuple[str | None, list[str]]:

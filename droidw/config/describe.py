@@ -111,8 +111,13 @@ def markdown(cls: type = DroidwConfig) -> str:
         head = row.key.rpartition(".")[0] or "parts and run"
         if head != section:
             section = head
-            lines += ["", f"## {head}", "", "| key | type | default | range | meaning |",
-                      "|---|---|---|---|---|"]
+            lines += [
+                "",
+                f"## {head}",
+                "",
+                "| key | type | default | range | meaning |",
+                "|---|---|---|---|---|",
+            ]
         cells = (f"`{row.key}`", row.type, f"`{row.default}`", row.limits, row.help)
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
     return "\n".join(lines) + "\n"

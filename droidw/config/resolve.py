@@ -128,8 +128,14 @@ def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
         raise _joined(problems, loaded)
     devices = _check_fit(config, parts, loaded)
     return ResolvedConfig(
-        config, parts, tuple(listed["exporters"]), tuple(listed["observers"]), devices,
-        loaded.sources, loaded.preset, origins,
+        config,
+        parts,
+        tuple(listed["exporters"]),
+        tuple(listed["observers"]),
+        devices,
+        loaded.sources,
+        loaded.preset,
+        origins,
     )
 
 

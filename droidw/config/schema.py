@@ -72,8 +72,10 @@ class MotionFilterConfig:
     threshold: float = opt(0.9, "mean flow from the last keyframe, in grid cells", gt=0)
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
-        0.3, "a frame in which less than this share of the cells is matched is taken at once",
-        ge=0, le=1,
+        0.3,
+        "a frame in which less than this share of the cells is matched is taken at once",
+        ge=0,
+        le=1,
     )
     lost_below: float = opt(
         0.03, "matched share below which a frame counts as blank or unrelated", ge=0, le=1
@@ -109,8 +111,9 @@ class FrontendConfig:
     warmup: int = opt(8, "keyframes before initialisation", ge=2)
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     init_beta: float = opt(0.25, "the same during initialisation", ge=0, le=1)
-    keyframe_threshold: float = opt(0.5, "distance below which the newest keyframe is dropped",
-                                    ge=0)
+    keyframe_threshold: float = opt(
+        0.5, "distance below which the newest keyframe is dropped", ge=0
+    )
     threshold: float = opt(16.0, "largest frame distance of a proximity edge, in cells", gt=0)
     window: int = opt(25, "keyframes searched for proximity edges", ge=2)
     radius: int = opt(2, "neighbours always linked", ge=1)
@@ -168,8 +171,9 @@ class WeightingConfig:
 class CloudConfig:
     """Which depths count as seen consistently, and go into the static cloud."""
 
-    relative_threshold: float = opt(0.02, "largest relative depth disagreement with a neighbour",
-                                    gt=0)
+    relative_threshold: float = opt(
+        0.02, "largest relative depth disagreement with a neighbour", gt=0
+    )
     min_views: int = opt(2, "neighbouring keyframes that must agree", ge=0)
     min_weight: float = opt(0.5, "smallest uncertainty weight of a static point", ge=0, le=1)
     far: float = opt(4.0, "depths beyond this many times the median are left out (0: keep)", ge=0)

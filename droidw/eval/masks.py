@@ -235,9 +235,7 @@ def read_uncertainty(path: Path) -> npt.NDArray[np.uint16]:
     return np.asarray(picture).astype(np.uint16)
 
 
-def resize_mask(
-    mask: npt.NDArray[np.bool_], shape: tuple[int, int]
-) -> npt.NDArray[np.bool_]:
+def resize_mask(mask: npt.NDArray[np.bool_], shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
     """Reduce a mask [H,W] to a grid [h,w]: True where at least half of a cell's area moves."""
     height, width = shape
     if mask.shape == shape:

@@ -191,9 +191,7 @@ def score(
         InputError: if stamps do not match or too few poses are usable.
     """
     if align not in get_args(Align):
-        raise UsageError(
-            f"'{align}' is no alignment", f"available: {', '.join(get_args(Align))}"
-        )
+        raise UsageError(f"'{align}' is no alignment", f"available: {', '.join(get_args(Align))}")
     delta = delta or Delta()
     notes: list[str] = []
     est, skipped = _usable(estimate, names[0], notes)
@@ -256,9 +254,7 @@ def _statistics(errors: Array) -> Statistics:
     return stats
 
 
-def _usable(
-    trajectory: Trajectory, name: str, notes: list[str]
-) -> tuple[Trajectory, int]:
+def _usable(trajectory: Trajectory, name: str, notes: list[str]) -> tuple[Trajectory, int]:
     """The finite poses in time order, quaternions normalised, and how many were left out."""
     T_wc = np.asarray(trajectory.T_wc, dtype=np.float64).reshape(-1, 7)
     times = np.asarray(trajectory.times, dtype=np.float64)
@@ -293,9 +289,7 @@ def _alignment(
     return scale, np.asarray(found.R, dtype=np.float64), np.asarray(found.t, dtype=np.float64)
 
 
-def _pairs(
-    times: Array, delta: Delta
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+def _pairs(times: Array, delta: Delta) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Every frame and the one `delta` later; in seconds, the nearest within a tenth of it."""
     count = len(times)
     if delta.unit == "frames":

@@ -86,7 +86,11 @@ def evaluate(
     ref_file = reference_file(reference)
     truth = _File.read(ref_file)
     options: dict[str, Any] = {
-        "align": align, "max_diff": max_diff, "offset": offset, "delta": delta, "unit": unit
+        "align": align,
+        "max_diff": max_diff,
+        "offset": offset,
+        "delta": delta,
+        "unit": unit,
     }
     frames = _score_file(_File.read(file), truth, options)
     keyframes = None
@@ -98,9 +102,7 @@ def evaluate(
         except InputError as error:
             # A clip with two keyframes has a trajectory worth scoring all the same.
             notes.append(f"keyframes are not scored: {error.message}")
-    return Evaluation(
-        frames, keyframes, _mask_score(run_dir, source, masks, notes), tuple(notes)
-    )
+    return Evaluation(frames, keyframes, _mask_score(run_dir, source, masks, notes), tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -128,9 +130,7 @@ class _File:
 
 
 def _score_file(est: _File, ref: _File, options: dict[str, Any]) -> TrajectoryScore:
-    scored = score(
-        est.trajectory, ref.trajectory, names=(str(est.path), str(ref.path)), **options
-    )
+    scored = score(est.trajectory, ref.trajectory, names=(str(est.path), str(ref.path)), **options)
     return replace(
         scored,
         skipped=scored.skipped + est.skipped,
@@ -246,9 +246,7 @@ def table(evaluation: Evaluation) -> str:
         f"RPE rmse [{unit}]",
         [f"{s.rpe_trans.rmse:.4f}" if s.rpe_trans else "-" for _, s in columns],
     )
-    row(
-        "RPE rmse [deg]", [f"{s.rpe_rot.rmse:.4f}" if s.rpe_rot else "-" for _, s in columns]
-    )
+    row("RPE rmse [deg]", [f"{s.rpe_rot.rmse:.4f}" if s.rpe_rot else "-" for _, s in columns])
     width = max(len(label) for label, _ in rows)
     lines = [f"{first.estimate}  against  {first.reference}"]
     lines += [

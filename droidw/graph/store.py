@@ -98,7 +98,7 @@ class KeyframeStore:
         return self._data[name][: len(self.infos)]
 
     @property
-    def T_cw(self) -> Tensor:  # noqa: N802 - frame names are part of the variable
+    def T_cw(self) -> Tensor:
         """[N,7] world to camera."""
         return self["T_cw"]
 
@@ -136,7 +136,7 @@ class KeyframeStore:
             data[index : n - 1] = data[index + 1 : n].clone()
         del self.infos[index]
 
-    def write(self, T_cw: Tensor, disps: Tensor) -> None:  # noqa: N803
+    def write(self, T_cw: Tensor, disps: Tensor) -> None:
         """Replace poses and disparities of all keyframes."""
         self.T_cw.copy_(T_cw)
         self.disps.copy_(disps)

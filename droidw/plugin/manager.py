@@ -26,8 +26,15 @@ from droidw.plugin.registry import KINDS, Entry, Failure, Registry, nearest
 if TYPE_CHECKING:
     from importlib import metadata
 
-__all__ = ["DISABLE_VARIABLE", "GROUP", "HOST", "LOAD_VARIABLE", "Plugins", "load_plugins",
-           "register"]
+__all__ = [
+    "DISABLE_VARIABLE",
+    "GROUP",
+    "HOST",
+    "LOAD_VARIABLE",
+    "Plugins",
+    "load_plugins",
+    "register",
+]
 
 GROUP = "droidw"
 """Entry-point group in which plugins are found."""
@@ -83,9 +90,7 @@ class Plugins:
             )
         entries = [e for e in self._entries if e.kind == kind]
         blocked = {
-            e.component.name
-            for e in entries
-            if self._blocked & {e.component.name, _full_name(e)}
+            e.component.name for e in entries if self._blocked & {e.component.name, _full_name(e)}
         }
         return Registry(
             KINDS[kind], entries, frozenset(blocked), tuple(self.failures), self.weights_dir
@@ -219,8 +224,13 @@ class Plugins:
                     raise PluginError(f"{caller.name}: a hook of droidw cannot be wrapped")
                 answer = impl.function()
                 entries.extend(
-                    Entry(HOOKS[caller.name], component, origin.plugin, origin.distribution,
-                          origin.version)
+                    Entry(
+                        HOOKS[caller.name],
+                        component,
+                        origin.plugin,
+                        origin.distribution,
+                        origin.version,
+                    )
                     for component in checked_components(caller.name, answer)
                 )
         if not callers:
@@ -282,9 +292,7 @@ def load_plugins(
     return plugins
 
 
-def register(
-    *things: object, to: Plugins | None = None, **components: Component[Any]
-) -> Plugins:
+def register(*things: object, to: Plugins | None = None, **components: Component[Any]) -> Plugins:
     """Bring one's own parts from Python.
 
     Args:

@@ -174,7 +174,7 @@ class Registry:
         return self.entry(name).component
 
     def status(self, name: str) -> str:
-        """"ready", or in a few words why the part cannot be used.
+        """ "ready", or in a few words why the part cannot be used.
 
         Examples: "needs droidw[open3d]", "weights missing: droid.pth", "no GPU visible".
 
@@ -228,8 +228,7 @@ class Registry:
                 f"'{name}' is registered but cannot run: its weights "
                 + ", ".join(f"'{w}'" for w in weights)
                 + f" are not in {self.weights_dir or 'any folder: none is set'}",
-                "put them there, or name their folder: DROIDW_WEIGHTS=FOLDER"
-                + self._instead(name),
+                "put them there, or name their folder: DROIDW_WEIGHTS=FOLDER" + self._instead(name),
             )
         reason = _unavailable(component)
         if reason:

@@ -17,8 +17,13 @@ import cv2
 import numpy as np
 import torch
 
-from droidw.errors import DroidwError, InputError, Interrupted, MissingRequirementError
-from droidw.errors import TrackingError
+from droidw.errors import (
+    DroidwError,
+    InputError,
+    Interrupted,
+    MissingRequirementError,
+    TrackingError,
+)
 from droidw.eval.metrics import score
 from droidw.events import Dispatcher, Progress, RunFailed, RunFinished, RunStarted
 from droidw.geometry.camera import Rectifier
@@ -85,20 +90,30 @@ class _Run:
     """State of one run between its stages."""
 
     def __init__(
-        self, resolved: ResolvedConfig, plugins: Plugins, run_dir: Path,
-        device: torch.device, stop: Stop, note: str,
+        self,
+        resolved: ResolvedConfig,
+        plugins: Plugins,
+        run_dir: Path,
+        device: torch.device,
+        stop: Stop,
+        note: str,
     ) -> None:
         self.resolved, self.plugins, self.run_dir = resolved, plugins, run_dir
         self.config, self.device, self.stop, self.note = resolved.config, device, stop, note
         self.started = time.perf_counter()
         self.context = BuildContext(
-            device=device, seed=self.config.seed, weights_dir=plugins.weights_dir,
-            run_dir=run_dir, compat=frozenset(self.config.compat),
+            device=device,
+            seed=self.config.seed,
+            weights_dir=plugins.weights_dir,
+            run_dir=run_dir,
+            compat=frozenset(self.config.compat),
         )
         _seed(self.config.seed, self.config.threads)
         self.events = Dispatcher(
-            [(part.name, part.factory(options, self.context)) for part, options
-             in resolved.observers]
+            [
+                (part.name, part.factory(options, self.context))
+                for part, options in resolved.observers
+            ]
         )
 
     def go(self) -> RunResult:
@@ -172,7 +187,7 @@ class _Run:
         stream = frames()
         try:
             system.track(self.stop.until(stream))
-        except Exception as error:  # noqa: BLE001 - raised again once all is written
+        except Exception as error:
             if not system.frames:
                 raise
             _log.debug("tracking stopped", exc_info=True)
@@ -182,14 +197,13 @@ class _Run:
             stream.close()
         return None
 
-    def _conclude(
-        self, failure: Exception | None, result: RunResult, outcome: Outcome
-    ) -> None:
+    def _conclude(self, failure: Exception | None, result: RunResult, outcome: Outcome) -> None:
         written = f"{len(result.trajectory)} poses were written to {self.run_dir}/trajectory.tum"
         if self.stop.signum:
             raise Interrupted(
                 f"stopped by a signal after frame {int(result.manifest['last_frame'])}",
-                self.stop.signum, written,
+                self.stop.signum,
+                written,
             )
         if failure is not None:
             raise failure
@@ -222,8 +236,7 @@ class _Run:
                 return reader.open(given.source, selection)
         what = Path(given.source)
         found = (
-            "there is no such file or folder" if not what.exists()
-            else "no reader recognises it"
+            "there is no such file or folder" if not what.exists() else "no reader recognises it"
         )
         raise InputError(
             f"{given.source}: {found}",
@@ -237,8 +250,11 @@ class _Run:
             return component.factory(options, self.context)
 
         return Parts(
-            features=part("features"), depth=part("depth"), uncertainty=part("uncertainty"),
-            ba=part("ba"), correspondence=part("correspondence"),
+            features=part("features"),
+            depth=part("depth"),
+            uncertainty=part("uncertainty"),
+            ba=part("ba"),
+            correspondence=part("correspondence"),
         )
 
     def _facts(self) -> dict[str, Any]:
@@ -305,8 +321,12 @@ class _Run:
             return None
 
     def _manifest(
-        self, system: SlamSystem, source: FrameSource, outcome: Outcome,
-        rectify: Rectifier, elapsed: float,
+        self,
+        system: SlamSystem,
+        source: FrameSource,
+        outcome: Outcome,
+        rectify: Rectifier,
+        elapsed: float,
     ) -> dict[str, Any]:
         frames = len(outcome.trajectory)
         working = rectify.camera
@@ -325,8 +345,12 @@ class _Run:
             "stages": {name: round(value, 4) for name, value in stages.items()},
             "camera": self.said,
             "intrinsics": {
-                "width": working.width, "height": working.height,
-                "fx": working.fx, "fy": working.fy, "cx": working.cx, "cy": working.cy,
+                "width": working.width,
+                "height": working.height,
+                "fx": working.fx,
+                "fy": working.fy,
+                "cx": working.cx,
+                "cy": working.cy,
             },
             "scale": "metric, from the depth prior" if self._metric(system) else "arbitrary",
             "preset": self.resolved.preset or "",
@@ -337,7 +361,8 @@ class _Run:
             "parts": describe_parts(self.resolved),
             "config_yaml": self.resolved.to_yaml(),
             "files": {
-                name: meaning for name, meaning in FILES.items()
+                name: meaning
+                for name, meaning in FILES.items()
                 if (self.run_dir / name).exists() or name in ("report.html", "manifest.json")
             },
         }
@@ -374,7 +399,7 @@ def _device(resolved: ResolvedConfig) -> torch.device:
 def _seed(seed: int, threads: int) -> None:
     """One seed, one order of operations: two runs give the same bytes on a CPU."""
     random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - plugins may use either generator
+    np.random.seed(seed)
     torch.manual_seed(seed)
     torch.set_num_threads(threads or os.cpu_count() or 1)
     # OpenCV's own threads make optical flow depend on their number; droidw runs its own.

@@ -64,8 +64,7 @@ def prepare(run_dir: Path, overwrite: bool) -> None:
         )
     if not {"config.yaml", "manifest.json", "log.txt"} & set(held):
         raise UsageError(
-            f"{run_dir}: --overwrite replaces an earlier run, and this is none "
-            f"(it holds {shown})",
+            f"{run_dir}: --overwrite replaces an earlier run, and this is none (it holds {shown})",
             "give another folder: -o FOLDER",
         )
     for name in FILES:

@@ -67,13 +67,20 @@ class Backend:
             part = slice(start, start + _CHUNK)
             near.append(
                 frame_distance(
-                    store.T_cw, store.disps, store.intrinsics,
-                    ii[part].to(store.device), jj[part].to(store.device), options.beta,
+                    store.T_cw,
+                    store.disps,
+                    store.intrinsics,
+                    ii[part].to(store.device),
+                    jj[part].to(store.device),
+                    options.beta,
                 ).cpu()
             )
         distance = np.full((count, count), np.inf)
         distance[ii.numpy(), jj.numpy()] = torch.cat(near).double().numpy()
         return backend_edges(
-            distance, radius=options.radius, nms=options.nms, threshold=options.threshold,
+            distance,
+            radius=options.radius,
+            nms=options.nms,
+            threshold=options.threshold,
             max_factors=options.factors_per_keyframe * count,
         )

@@ -39,7 +39,7 @@ def consistent_depth(store: KeyframeStore, relative_threshold: float, min_views:
         ii = torch.arange(first, last, device=store.device)
         jj = ii + gap
         coords, valid = reproject(store.T_cw, store.disps, store.intrinsics, ii, jj)
-        G = relative_pose(store.T_cw, ii, jj)  # noqa: N806
+        G = relative_pose(store.T_cw, ii, jj)
         there = _depth_there(store, G, ii)
         x0, y0 = coords[..., 0].floor().long(), coords[..., 1].floor().long()
         agrees = torch.zeros_like(valid)
@@ -54,10 +54,10 @@ def consistent_depth(store: KeyframeStore, relative_threshold: float, min_views:
     return views >= min_views
 
 
-def _depth_there(store: KeyframeStore, G: Tensor, ii: Tensor) -> Tensor:  # noqa: N803
+def _depth_there(store: KeyframeStore, G: Tensor, ii: Tensor) -> Tensor:
     """Depth [E,h,w] that the cells of frames ii have in the other camera."""
     rays = _rays(store)
-    R, t = se3.rotation(G), G[:, :3]  # noqa: N806
+    R, t = se3.rotation(G), G[:, :3]
     disps = store.disps[ii]
     z = torch.einsum("ec,hwc->ehw", R[:, 2], rays) / disps + t[:, 2, None, None]
     return z
@@ -89,7 +89,7 @@ def static_cloud(
     if options.far > 0 and bool(keep.any()):
         keep &= depth < options.far * depth[keep].median()
     rays = _rays(store)
-    T_wc = se3.inv(store.T_cw)  # noqa: N806
+    T_wc = se3.inv(store.T_cw)
     points = se3.act(T_wc[:, None], (rays[None] * depth[..., None]).flatten(1, 2))
     chosen = keep.flatten().nonzero()[:, 0]
     if len(chosen) > options.max_points:

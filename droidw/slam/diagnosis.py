@@ -40,9 +40,7 @@ class Diagnosis:
         if self.frames == 1:
             told.append("one frame only: its pose is the identity and no depth is known")
         elif self.still and not self.unmatched:
-            told.append(
-                "the camera did not move: every pose is the same and no depth can be known"
-            )
+            told.append("the camera did not move: every pose is the same and no depth can be known")
         elif self.keyframes > 1 and self.parallax < MIN_PARALLAX:
             told.append(
                 f"almost no parallax (median {self.parallax:.2f} grid cells between keyframes): "
@@ -61,8 +59,9 @@ MIN_PARALLAX = 0.05
 """Median translational flow between keyframes, in cells, below which positions mean little."""
 
 
-def diagnose(store: KeyframeStore, moved: Sequence[float], matched: Sequence[float],
-             lost_below: float) -> Diagnosis:
+def diagnose(
+    store: KeyframeStore, moved: Sequence[float], matched: Sequence[float], lost_below: float
+) -> Diagnosis:
     """Facts known after tracking.
 
     Args:
@@ -73,7 +72,10 @@ def diagnose(store: KeyframeStore, moved: Sequence[float], matched: Sequence[flo
     """
     lost = sum(share < lost_below for share in matched) / max(1, len(matched))
     return Diagnosis(
-        frames=len(moved) + 1, keyframes=len(store), still=len(store) < 2, lost=lost,
+        frames=len(moved) + 1,
+        keyframes=len(store),
+        still=len(store) < 2,
+        lost=lost,
         unmatched=len(matched) > 0 and lost == 1.0,
     )
 
@@ -84,7 +86,7 @@ def parallax(store: KeyframeStore) -> float:
     if count < 2:
         return float("nan")
     ii = torch.arange(count - 1, device=store.device)
-    G = se3.mul(store.T_cw[ii + 1], se3.inv(store.T_cw[ii]))  # noqa: N806
+    G = se3.mul(store.T_cw[ii + 1], se3.inv(store.T_cw[ii]))
     fx, fy, cx, cy = store.intrinsics.unbind()
     grid = pixel_grid(store.grid.height, store.grid.width, device=store.device)
     t = G[:, None, None, :3] * store.disps[ii][..., None]

@@ -51,7 +51,7 @@ class Filler:
 
     def start(self, time: float) -> Tensor:
         """Interpolated pose [7] at `time`; held motion beyond the last keyframe."""
-        T_cw = self.optimiser.store.T_cw  # noqa: N806
+        T_cw = self.optimiser.store.T_cw
         before, after = self.neighbours(time)
         if before != after:
             share = (time - self._times[before]) / (self._times[after] - self._times[before])
@@ -83,7 +83,7 @@ class Filler:
         ii = torch.tensor([i for i, _ in pairs], dtype=torch.int64, device=device)
         jj = torch.tensor([j for _, j in pairs], dtype=torch.int64, device=device)
         at = torch.tensor(used, dtype=torch.int64, device=device)
-        T_cw = torch.cat([store.T_cw[at], start])  # noqa: N806
+        T_cw = torch.cat([store.T_cw[at], start])
         blank = store.disps.new_ones(len(batch), *store.disps.shape[1:])
         disps = torch.cat([store.disps[at], blank])
         gates = torch.cat([self._gates[at], blank])
@@ -106,20 +106,35 @@ class Filler:
                 )
             weighting = self.config.weighting
             weight = residual_weights(
-                answer.confidence, None, gates if phase.weigh else None, ii, jj, answer.target,
-                bidirectional=False, scale=weighting.confidence_scale,
+                answer.confidence,
+                None,
+                gates if phase.weigh else None,
+                ii,
+                jj,
+                answer.target,
+                bidirectional=False,
+                scale=weighting.confidence_scale,
             )
             with optimiser.clock("fill: bundle"):
                 for _ in range(phase.iterations):
                     step = optimiser.parts.ba.step(
                         BAProblem(
-                            T_cw=T_cw, disps=disps, intrinsics=store.intrinsics, ii=ii, jj=jj,
-                            target=answer.target, weight=weight, fixed=fixed,
-                            damping=torch.zeros_like(disps), motion_only=True,
-                            lm=solver.lm, ep=solver.ep, huber=solver.huber or None,
+                            T_cw=T_cw,
+                            disps=disps,
+                            intrinsics=store.intrinsics,
+                            ii=ii,
+                            jj=jj,
+                            target=answer.target,
+                            weight=weight,
+                            fixed=fixed,
+                            damping=torch.zeros_like(disps),
+                            motion_only=True,
+                            lm=solver.lm,
+                            ep=solver.ep,
+                            huber=solver.huber or None,
                         )
                     )
-                    T_cw = step.T_cw  # noqa: N806
+                    T_cw = step.T_cw
         return T_cw[len(used) :]
 
     def _sources(self, time: float) -> list[int]:

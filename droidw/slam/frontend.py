@@ -73,17 +73,19 @@ class Frontend:
         row = self.config.schedule[phase]
         for _ in range(row.updates):
             self.optimiser.update(
-                self.graph, self.session, row, self.config.solver,
-                first_free=first_free, informed=informed,
+                self.graph,
+                self.session,
+                row,
+                self.config.solver,
+                first_free=first_free,
+                informed=informed,
             )
 
     def _window(self, forced: bool) -> bool:
         options, graph, store = self.options, self.graph, self.store
         count = len(store)
         self._retire([r for r in graph.select() if graph.age[r] > options.max_age])
-        self._propose(
-            count - 5, max(count - options.window, 0), options.beta, nms=options.nms
-        )
+        self._propose(count - 5, max(count - options.window, 0), options.beta, nms=options.nms)
         self._retire(graph.oldest(options.max_factors))
         graph.drop_before(max(0, count - 2 * options.window))
         self._updates("window", self._first_free())
@@ -134,9 +136,14 @@ class Frontend:
             measured = self._distance(ii[lower], jj[lower], beta)
             distance[lower.numpy()] = measured.double().cpu().numpy()
         edges = frontend_edges(
-            distance, first_i, first_j, self.graph.pairs,
-            radius=self.options.radius, nms=nms,
-            threshold=self.options.threshold, max_factors=self.options.max_factors,
+            distance,
+            first_i,
+            first_j,
+            self.graph.pairs,
+            radius=self.options.radius,
+            nms=nms,
+            threshold=self.options.threshold,
+            max_factors=self.options.max_factors,
         )
         self.graph.add(edges)
 

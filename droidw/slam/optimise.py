@@ -111,9 +111,7 @@ class Optimiser:
         active = graph.select()
         self.measure(graph, session, active, informed)
         low = max(0, first_free - reach)
-        retired = [
-            r for r in graph.select(active=False) if min(graph.ii[r], graph.jj[r]) >= low
-        ]
+        retired = [r for r in graph.select(active=False) if min(graph.ii[r], graph.jj[r]) >= low]
         self.adjust(graph, sorted(active + retired), phase, solver, first_free)
         graph.grow_older(active)
 
@@ -155,8 +153,14 @@ class Optimiser:
         low = int(torch.minimum(ii.min(), jj.min()))
         gates = self.gates(low) if phase.weigh else None
         weight = residual_weights(
-            confidence, None, gates, ii - low, jj - low, target,
-            bidirectional=weighting.bidirectional, scale=weighting.confidence_scale,
+            confidence,
+            None,
+            gates,
+            ii - low,
+            jj - low,
+            target,
+            bidirectional=weighting.bidirectional,
+            scale=weighting.confidence_scale,
         )
         count = len(store) - low
         fixed = torch.arange(count, device=store.device) < first_free - low

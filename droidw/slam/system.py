@@ -140,9 +140,7 @@ class SlamSystem:
         kept = False
         if verdict.keep:
             kept = self._keyframe(current, verdict.forced)
-        self.events.emit(
-            FrameTracked(frame.index, frame.time, len(self._times), len(self.store))
-        )
+        self.events.emit(FrameTracked(frame.index, frame.time, len(self._times), len(self.store)))
         return kept
 
     def _remember(self, current: Encoded) -> None:
@@ -173,7 +171,10 @@ class SlamSystem:
         pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
         number = store.append(
             KeyframeInfo(frame.index, frame.time, frame.name, pixels.cpu().numpy(), payload),
-            T_cw=pose, disps=disp, features=features, prior=prior,
+            T_cw=pose,
+            disps=disp,
+            features=features,
+            prior=prior,
         )
         with self.clock("uncertainty"):
             parts.uncertainty.append(self.optimiser.view(), number)
@@ -251,16 +252,14 @@ class SlamSystem:
                 poses[index] = filler.keyframe_pose(index)
             elif index not in poses:
                 poses[index] = filler.start(time)
-        T_cw = torch.stack([poses[i] for i in self._indices]).double()  # noqa: N806
+        T_cw = torch.stack([poses[i] for i in self._indices]).double()
         return Trajectory(
             times=np.asarray(self._times, dtype=np.float64),
             T_wc=inv(T_cw).cpu().numpy(),
             is_keyframe=np.asarray([filler.is_keyframe(i) for i in self._indices]),
         )
 
-    def _unfilled(
-        self, filler: Filler, reread: Callable[[], Iterable[Frame]]
-    ) -> Iterator[Encoded]:
+    def _unfilled(self, filler: Filler, reread: Callable[[], Iterable[Frame]]) -> Iterator[Encoded]:
         """Every frame that is no keyframe, from memory or from a second pass."""
         if len(self._kept) == len(self._indices):
             blank = torch.zeros(0)
@@ -280,7 +279,7 @@ class SlamSystem:
             return (), static_cloud(store, torch.zeros(0), torch.zeros(0), cloud)
         valid = consistent_depth(store, cloud.relative_threshold, cloud.min_views)
         weight = self.optimiser.gates()
-        T_wc = inv(store.T_cw.double()).cpu().numpy()  # noqa: N806
+        T_wc = inv(store.T_cw.double()).cpu().numpy()
         intrinsics = store.image_intrinsics.double().cpu().numpy()
         records = tuple(
             KeyframeRecord(

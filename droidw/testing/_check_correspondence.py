@@ -31,9 +31,11 @@ def correspondence(subject: Subject) -> None:
     """See `droidw.testing.conformance.check_correspondence`."""
     part = subject.build(seed=3)
     subject.follows(part, Correspondence)
-    subject.expect("grid", isinstance(part.stride, int) and part.stride >= 1
-                   and 0 <= part.offset < part.stride,
-                   f"stride {part.stride!r} and offset {part.offset!r} make no grid")
+    subject.expect(
+        "grid",
+        isinstance(part.stride, int) and part.stride >= 1 and 0 <= part.offset < part.stride,
+        f"stride {part.stride!r} and offset {part.offset!r} make no grid",
+    )
     scene = Scene(SceneSpec())
     pictures = [scene.render(k) for k in _INDICES]
     for rows, columns in _CROPS:
@@ -41,11 +43,15 @@ def correspondence(subject: Subject) -> None:
         frames = []
         for picture in pictures:
             image = torch.from_numpy(picture.image[:rows, :columns].copy())
-            frames.append(Frame(
-                picture.index, picture.time,
-                image.permute(2, 0, 1).float().div(255).contiguous().to(subject.device),
-                torch.from_numpy(scene.intrinsics).float().to(subject.device),
-                f"{picture.index:06d}"))
+            frames.append(
+                Frame(
+                    picture.index,
+                    picture.time,
+                    image.permute(2, 0, 1).float().div(255).contiguous().to(subject.device),
+                    torch.from_numpy(scene.intrinsics).float().to(subject.device),
+                    f"{picture.index:06d}",
+                )
+            )
         grid = Grid.of(rows, columns, part.stride, part.offset)
         label = f"pictures of {columns}x{rows}"
         payloads = _encode(subject, part, frames, grid)
@@ -53,10 +59,13 @@ def correspondence(subject: Subject) -> None:
         _accuracy(subject, scene, update, grid, label)
         twin = subject.build(seed=3)
         other = twin.session().update(
-            _request(subject, _encode(subject, twin, frames, grid), grid, list(range(4)), _EDGES))
-        subject.expect("deterministic", same(update.target, other.target)
-                       and same(update.confidence, other.confidence),
-                       f"two operators of one seed answer differently for {label}")
+            _request(subject, _encode(subject, twin, frames, grid), grid, list(range(4)), _EDGES)
+        )
+        subject.expect(
+            "deterministic",
+            same(update.target, other.target) and same(update.confidence, other.confidence),
+            f"two operators of one seed answer differently for {label}",
+        )
         _motion(subject, part, payloads)
 
 
@@ -70,16 +79,27 @@ def _encode(subject: Subject, part: Any, frames: list[Frame], grid: Grid) -> lis
     return payloads
 
 
-def _request(subject: Subject, payloads: list[Any], grid: Grid, ids: list[int],
-             edges: tuple[tuple[int, int], ...]) -> EdgeRequest:
+def _request(
+    subject: Subject,
+    payloads: list[Any],
+    grid: Grid,
+    ids: list[int],
+    edges: tuple[tuple[int, int], ...],
+) -> EdgeRequest:
     """A question without any knowledge of poses: every cell is expected where it was."""
     h, w = grid.height, grid.width
     y, x = torch.meshgrid(torch.arange(float(h)), torch.arange(float(w)), indexing="ij")
     coords = torch.stack([x, y], dim=-1).expand(len(edges), h, w, 2).contiguous()
     valid = torch.ones(len(edges), h, w, dtype=torch.bool)
-    return EdgeRequest(ids, [i for i, _ in edges], [j for _, j in edges],
-                       coords.to(subject.device), valid.to(subject.device),
-                       payloads.__getitem__, informed=False)
+    return EdgeRequest(
+        ids,
+        [i for i, _ in edges],
+        [j for _, j in edges],
+        coords.to(subject.device),
+        valid.to(subject.device),
+        payloads.__getitem__,
+        informed=False,
+    )
 
 
 def _ask(subject: Subject, session: EdgeSession, request: EdgeRequest, label: str) -> EdgeUpdate:
@@ -88,17 +108,24 @@ def _ask(subject: Subject, session: EdgeSession, request: EdgeRequest, label: st
         update = session.update(request)
     subject.unchanged("the request's coords", coords, request.coords)
     subject.expect("no-mutation", ids == request.ids, "the request's ids were changed")
-    subject.expect("shape", isinstance(update, EdgeUpdate),
-                   f"update returned a {type(update).__name__}, not an EdgeUpdate")
+    subject.expect(
+        "shape",
+        isinstance(update, EdgeUpdate),
+        f"update returned a {type(update).__name__}, not an EdgeUpdate",
+    )
     shape = tuple(request.coords.shape)
     subject.tensor(f"the target for {label}", update.target, shape)
     subject.tensor(f"the confidence for {label}", update.confidence, shape)
-    subject.expect("range", bool((update.confidence >= 0).all()),
-                   f"a confidence is negative for {label}")
+    subject.expect(
+        "range", bool((update.confidence >= 0).all()), f"a confidence is negative for {label}"
+    )
     if update.damping is not None or update.upmask is not None:
         sources = sorted(set(request.ii))
-        subject.expect("sources", update.sources == sources,
-                       f"sources is {update.sources}, but the source frames are {sources}")
+        subject.expect(
+            "sources",
+            update.sources == sources,
+            f"sources is {update.sources}, but the source frames are {sources}",
+        )
     for name in ("damping", "upmask"):
         value = getattr(update, name)
         if value is not None:
@@ -107,60 +134,97 @@ def _ask(subject: Subject, session: EdgeSession, request: EdgeRequest, label: st
     return update
 
 
-def _sessions(subject: Subject, part: Any, payloads: list[Any], grid: Grid,
-              label: str) -> EdgeUpdate:
+def _sessions(
+    subject: Subject, part: Any, payloads: list[Any], grid: Grid, label: str
+) -> EdgeUpdate:
     for purpose in ("global", "fill"):
         with subject.calling(f"session('{purpose}')"):
             session = part.session(purpose)
-        _ask(subject, session, _request(subject, payloads, grid, [5], ((1, 0),)),
-             f"{label} ({purpose})")
+        _ask(
+            subject,
+            session,
+            _request(subject, payloads, grid, [5], ((1, 0),)),
+            f"{label} ({purpose})",
+        )
     with subject.calling("session()"):
         session = part.session()
     subject.follows(session, EdgeSession)
     _ask(subject, session, _request(subject, payloads, grid, [], ()), f"no edges at all, {label}")
     first = _ask(subject, session, _request(subject, payloads, grid, [3, 8, 1, 20], _EDGES), label)
-    turned = _ask(subject, part.session(),
-                  _request(subject, payloads, grid, [20, 1, 8, 3], _EDGES[::-1]), label)
-    subject.expect("order", bool(torch.allclose(turned.target.flip(0), first.target, atol=1e-3)),
-                   "the answers do not come in the order of the request")
-    _ask(subject, session, _request(subject, payloads, grid, [8, 21], ((1, 0), (0, 2))),
-         f"a known and a new edge, {label}")
+    turned = _ask(
+        subject,
+        part.session(),
+        _request(subject, payloads, grid, [20, 1, 8, 3], _EDGES[::-1]),
+        label,
+    )
+    subject.expect(
+        "order",
+        bool(torch.allclose(turned.target.flip(0), first.target, atol=1e-3)),
+        "the answers do not come in the order of the request",
+    )
+    _ask(
+        subject,
+        session,
+        _request(subject, payloads, grid, [8, 21], ((1, 0), (0, 2))),
+        f"a known and a new edge, {label}",
+    )
     with subject.calling("forget, with an unknown id among them,"):
         session.forget([3, 1, 12345])
     # A forgotten id is new: it must get the answer of its new edge.
-    reused = _ask(subject, session, _request(subject, payloads, grid, [3], ((1, 2),)),
-                  f"an id used again after forget, {label}")
-    subject.expect("forget", bool(torch.allclose(reused.target[0], first.target[2], atol=1e-3)),
-                   "an id that was forgotten and used for another edge gets a stale answer")
+    reused = _ask(
+        subject,
+        session,
+        _request(subject, payloads, grid, [3], ((1, 2),)),
+        f"an id used again after forget, {label}",
+    )
+    subject.expect(
+        "forget",
+        bool(torch.allclose(reused.target[0], first.target[2], atol=1e-3)),
+        "an id that was forgotten and used for another edge gets a stale answer",
+    )
     return first
 
 
-def _accuracy(subject: Subject, scene: Scene, update: EdgeUpdate, grid: Grid,
-              label: str) -> None:
+def _accuracy(subject: Subject, scene: Scene, update: EdgeUpdate, grid: Grid, label: str) -> None:
     cells = grid.centres().double().numpy()
     for number, (i, j) in enumerate(_EDGES):
         truth = scene.correspond(_INDICES[i], _INDICES[j], cells)
         target = update.target[number].cpu().double().numpy() * grid.stride + grid.offset
         confidence = update.confidence[number].amax(dim=-1).cpu().numpy()
         sure = confidence > 0.5 * confidence.max() if confidence.max() > 0 else confidence > 0
-        subject.expect("accuracy", bool(sure.mean() > 0.1),
-                       f"hardly any cell of {label} has confidence, though 9 in 10 are visible")
+        subject.expect(
+            "accuracy",
+            bool(sure.mean() > 0.1),
+            f"hardly any cell of {label} has confidence, though 9 in 10 are visible",
+        )
         error = np.linalg.norm(target - truth.target, axis=-1)[sure & truth.visible]
         median = float(np.median(error)) if len(error) else float("inf")
-        subject.expect("accuracy", median < 2.0,
-                       f"the median error of confident cells is {median:.2f} pixels for {label}, "
-                       f"edge {i} -> {j}; 2 pixels at most are due")
+        subject.expect(
+            "accuracy",
+            median < 2.0,
+            f"the median error of confident cells is {median:.2f} pixels for {label}, "
+            f"edge {i} -> {j}; 2 pixels at most are due",
+        )
 
 
 def _motion(subject: Subject, part: Any, payloads: list[Any]) -> None:
     with subject.calling("motion"):
         still, near, far = (part.motion(payloads[0], payloads[k]) for k in (0, 1, 2))
     for motion in (still, near, far):
-        subject.expect("motion", isinstance(motion, Motion) and np.isfinite(motion.flow)
-                       and motion.flow >= 0 and 0 <= motion.matched <= 1,
-                       f"motion returned {motion!r}")
-    subject.expect("motion", still.flow < 0.1,
-                   f"a frame has moved by {still.flow:.2f} cells against itself")
-    subject.expect("motion", still.flow <= near.flow < far.flow,
-                   f"motion does not grow with the distance of frames: {near.flow:.2f} cells after "
-                   f"3 frames, {far.flow:.2f} after 6")
+        subject.expect(
+            "motion",
+            isinstance(motion, Motion)
+            and np.isfinite(motion.flow)
+            and motion.flow >= 0
+            and 0 <= motion.matched <= 1,
+            f"motion returned {motion!r}",
+        )
+    subject.expect(
+        "motion", still.flow < 0.1, f"a frame has moved by {still.flow:.2f} cells against itself"
+    )
+    subject.expect(
+        "motion",
+        still.flow <= near.flow < far.flow,
+        f"motion does not grow with the distance of frames: {near.flow:.2f} cells after "
+        f"3 frames, {far.flow:.2f} after 6",
+    )

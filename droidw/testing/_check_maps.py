@@ -26,12 +26,18 @@ def _pictures(subject: Subject) -> Iterator[tuple[str, Tensor, Tensor]]:
     intrinsics = torch.from_numpy(scene.intrinsics).float()
     for width, height in _SIZES:
         image = picture[:, :height, :width].contiguous()
-        yield (f"a picture of {width}x{height}", image.to(subject.device),
-               intrinsics.to(subject.device))
+        yield (
+            f"a picture of {width}x{height}",
+            image.to(subject.device),
+            intrinsics.to(subject.device),
+        )
     black = torch.zeros(3, 72, 96, device=subject.device)
     yield "a black picture", black, torch.tensor([80.0, 80, 47.5, 35.5], device=subject.device)
-    yield ("a white picture", torch.ones_like(black),
-           torch.tensor([80.0, 80, 47.5, 35.5], device=subject.device))
+    yield (
+        "a white picture",
+        torch.ones_like(black),
+        torch.tensor([80.0, 80, 47.5, 35.5], device=subject.device),
+    )
 
 
 def feature_extractor(subject: Subject) -> None:
@@ -41,9 +47,12 @@ def feature_extractor(subject: Subject) -> None:
     dim = part.dim
     subject.expect("dim", isinstance(dim, int) and dim >= 0, f"dim is {dim!r}")
     claims = "features" in subject.component.capabilities
-    subject.expect("capability", claims == (dim > 0),
-                   f"dim is {dim}, but the capability 'features' is "
-                   + ("claimed" if claims else "not claimed"))
+    subject.expect(
+        "capability",
+        claims == (dim > 0),
+        f"dim is {dim}, but the capability 'features' is "
+        + ("claimed" if claims else "not claimed"),
+    )
     for what, image, _ in _pictures(subject):
         for stride, offset in ((8, 3.5), (4, 1.5)):
             grid = Grid.of(image.shape[-2], image.shape[-1], stride, offset)
@@ -52,13 +61,20 @@ def feature_extractor(subject: Subject) -> None:
                 features = part.extract(image, grid)
                 again, other = part.extract(image, grid), twin.extract(image, grid)
             label = f"the result of extract on {what}, stride {stride},"
-            subject.tensor(label, features, (dim, grid.height, grid.width),
-                           (torch.float32, torch.float16))
+            subject.tensor(
+                label, features, (dim, grid.height, grid.width), (torch.float32, torch.float16)
+            )
             subject.unchanged(f"the image given to extract ({what})", before, image)
-            subject.expect("deterministic", same(features, again),
-                           f"extract gives different features for {what} when asked again")
-            subject.expect("deterministic", same(features, other),
-                           f"two extractors of one seed give different features for {what}")
+            subject.expect(
+                "deterministic",
+                same(features, again),
+                f"extract gives different features for {what} when asked again",
+            )
+            subject.expect(
+                "deterministic",
+                same(features, other),
+                f"two extractors of one seed give different features for {what}",
+            )
 
 
 def depth_prior(subject: Subject) -> None:
@@ -72,14 +88,26 @@ def depth_prior(subject: Subject) -> None:
         with subject.calling(f"predict on {what}"):
             depth, again, other = part.predict(frame), part.predict(frame), twin.predict(frame)
         subject.unchanged(f"the frame given to predict ({what})", before, frame)
-        subject.expect("deterministic", same(depth, again) and same(depth, other),
-                       f"predict gives different depth for {what} when asked again")
+        subject.expect(
+            "deterministic",
+            same(depth, again) and same(depth, other),
+            f"predict gives different depth for {what} when asked again",
+        )
         if depth is None:
             continue
-        subject.expect("capability", "depth" in subject.component.capabilities,
-                       "it gives depth, but does not claim the capability 'depth'")
-        subject.expect("shape", isinstance(depth, DepthMap),
-                       f"predict returned a {type(depth).__name__}, not a DepthMap or None")
+        subject.expect(
+            "capability",
+            "depth" in subject.component.capabilities,
+            "it gives depth, but does not claim the capability 'depth'",
+        )
+        subject.expect(
+            "shape",
+            isinstance(depth, DepthMap),
+            f"predict returned a {type(depth).__name__}, not a DepthMap or None",
+        )
         subject.tensor(f"the depth of {what}", depth.depth, tuple(image.shape[-2:]))
-        subject.expect("range", bool((depth.depth >= 0).all()),
-                       f"the depth of {what} is negative somewhere; 0 means unknown")
+        subject.expect(
+            "range",
+            bool((depth.depth >= 0).all()),
+            f"the depth of {what} is negative somewhere; 0 means unknown",
+        )

@@ -35,21 +35,33 @@ def uncertainty_model(subject: Subject) -> None:
             continue
         label = f"with {channels} channels of {dtype}"
         maps = [_run(subject, subject.build(seed=3), channels, dtype, label) for _ in range(2)]
-        subject.expect("deterministic", same(maps[0], maps[1]),
-                       f"two models of one seed give different maps {label}")
+        subject.expect(
+            "deterministic",
+            same(maps[0], maps[1]),
+            f"two models of one seed give different maps {label}",
+        )
     _state(subject)
 
 
 def _fields(subject: Subject, part: Any) -> None:
     names = []
     for entry in part.fields:
-        subject.expect("fields", isinstance(entry, StoreField),
-                       f"fields holds a {type(entry).__name__}, not a StoreField")
+        subject.expect(
+            "fields",
+            isinstance(entry, StoreField),
+            f"fields holds a {type(entry).__name__}, not a StoreField",
+        )
         known = all(isinstance(n, int) or n in ("h", "w", "c") for n in entry.shape)
-        subject.expect("fields", known, f"field '{entry.name}' has shape {entry.shape}; valid are "
-                       "numbers, 'h', 'w' and 'c'")
-        subject.expect("fields", isinstance(getattr(torch, entry.dtype, None), torch.dtype),
-                       f"field '{entry.name}' has the unknown dtype '{entry.dtype}'")
+        subject.expect(
+            "fields",
+            known,
+            f"field '{entry.name}' has shape {entry.shape}; valid are numbers, 'h', 'w' and 'c'",
+        )
+        subject.expect(
+            "fields",
+            isinstance(getattr(torch, entry.dtype, None), torch.dtype),
+            f"field '{entry.name}' has the unknown dtype '{entry.dtype}'",
+        )
         names.append(entry.name)
     subject.expect("fields", len(set(names)) == len(names), "two fields have the same name")
 
@@ -63,21 +75,32 @@ def _run(subject: Subject, part: Any, channels: int, dtype: torch.dtype, label: 
         _inputs_kept(subject, before, view, "append")
         _maps(subject, view, f"after append {label}")
         others = [n for n in range(_N) if n != index]
-        subject.expect("only-asked", same(before.uncertainty[others], view.uncertainty[others]),
-                       f"append of keyframe {index} changed the map of another one")
+        subject.expect(
+            "only-asked",
+            same(before.uncertainty[others], view.uncertainty[others]),
+            f"append of keyframe {index} changed the map of another one",
+        )
     for iteration in range(2):
         before = snapshot(view)
         with subject.calling(f"update {label}"):
             report = part.update(dataclasses.replace(view, iteration=iteration))
         _inputs_kept(subject, before, view, "update")
         _maps(subject, view, f"after update {label}")
-        subject.expect("only-asked", same(before.uncertainty[3], view.uncertainty[3]),
-                       "update changed the map of a keyframe that is not in `frames`")
-        subject.expect("report", isinstance(report, UncertaintyReport),
-                       f"update returned a {type(report).__name__}, not an UncertaintyReport")
-        subject.expect("report", math.isfinite(report.energy)
-                       and all(math.isfinite(v) for v in report.facts.values()),
-                       "a number in the report of update is not finite")
+        subject.expect(
+            "only-asked",
+            same(before.uncertainty[3], view.uncertainty[3]),
+            "update changed the map of a keyframe that is not in `frames`",
+        )
+        subject.expect(
+            "report",
+            isinstance(report, UncertaintyReport),
+            f"update returned a {type(report).__name__}, not an UncertaintyReport",
+        )
+        subject.expect(
+            "report",
+            math.isfinite(report.energy) and all(math.isfinite(v) for v in report.facts.values()),
+            "a number in the report of update is not finite",
+        )
     blind = dataclasses.replace(view, confidence=torch.zeros_like(view.confidence), iteration=2)
     with subject.calling("update without any confidence"):
         part.update(blind)
@@ -88,22 +111,30 @@ def _run(subject: Subject, part: Any, channels: int, dtype: torch.dtype, label: 
     return view.uncertainty
 
 
-def _inputs_kept(subject: Subject, before: UncertaintyView, view: UncertaintyView,
-                 call: str) -> None:
+def _inputs_kept(
+    subject: Subject, before: UncertaintyView, view: UncertaintyView, call: str
+) -> None:
     for entry in dataclasses.fields(UncertaintyView):
         if entry.name not in _OWN:
-            subject.unchanged(f"view.{entry.name} given to {call}", getattr(before, entry.name),
-                              getattr(view, entry.name))
+            subject.unchanged(
+                f"view.{entry.name} given to {call}",
+                getattr(before, entry.name),
+                getattr(view, entry.name),
+            )
 
 
 def _maps(subject: Subject, view: UncertaintyView, when: str) -> None:
     subject.tensor(f"view.uncertainty {when}", view.uncertainty, (_N, _H, _W))
-    subject.expect("range", bool((view.uncertainty >= 0).all()),
-                   f"the uncertainty is negative somewhere {when}")
+    subject.expect(
+        "range",
+        bool((view.uncertainty >= 0).all()),
+        f"the uncertainty is negative somewhere {when}",
+    )
     for name, value in view.fields.items():
         if value.is_floating_point():
-            subject.expect("finite", bool(torch.isfinite(value).all()),
-                           f"field '{name}' has NaN or inf {when}")
+            subject.expect(
+                "finite", bool(torch.isfinite(value).all()), f"field '{name}' has NaN or inf {when}"
+            )
 
 
 def _state(subject: Subject) -> None:
@@ -115,13 +146,18 @@ def _state(subject: Subject) -> None:
             first.append(_without_edges(view), index)
         first.update(view)
         copied = dataclasses.replace(
-            view, uncertainty=view.uncertainty.clone(),
-            fields={name: value.clone() for name, value in view.fields.items()})
+            view,
+            uncertainty=view.uncertainty.clone(),
+            fields={name: value.clone() for name, value in view.fields.items()},
+        )
         second.load_state_dict(snapshot(first.state_dict()))
         first.update(dataclasses.replace(view, iteration=1))
         second.update(dataclasses.replace(copied, iteration=1))
-    subject.expect("state", same(view.uncertainty, copied.uncertainty),
-                   "a model restored from state_dict() does not continue as the original")
+    subject.expect(
+        "state",
+        same(view.uncertainty, copied.uncertainty),
+        "a model restored from state_dict() does not continue as the original",
+    )
 
 
 def _view(subject: Subject, part: Any, channels: int, dtype: torch.dtype) -> UncertaintyView:
@@ -130,8 +166,12 @@ def _view(subject: Subject, part: Any, channels: int, dtype: torch.dtype) -> Unc
     device = subject.device
     sizes = {"h": _H, "w": _W, "c": channels}
     fields = {
-        f.name: torch.full((_N, *(n if isinstance(n, int) else sizes[n] for n in f.shape)),
-                           f.fill, dtype=getattr(torch, f.dtype), device=device)
+        f.name: torch.full(
+            (_N, *(n if isinstance(n, int) else sizes[n] for n in f.shape)),
+            f.fill,
+            dtype=getattr(torch, f.dtype),
+            device=device,
+        )
         for f in part.fields
     }
     T_cw = se3.identity(_N).float()
@@ -143,13 +183,21 @@ def _view(subject: Subject, part: Any, channels: int, dtype: torch.dtype) -> Unc
     target = torch.stack([x + shift[:, None, None], y.expand(6, _H, _W)], dim=-1)
     features = torch.randn(_N, channels, _H, _W, generator=draw).to(dtype)
     return UncertaintyView(
-        features.to(device), torch.zeros(_N, _H, _W, device=device), fields, T_cw.to(device),
+        features.to(device),
+        torch.zeros(_N, _H, _W, device=device),
+        fields,
+        T_cw.to(device),
         torch.full((_N, _H, _W), 1.0, device=device),
-        torch.tensor([10.0, 10.0, 5.0, 4.0], device=device), ii.to(device), jj.to(device),
-        target.to(device), torch.ones(6, _H, _W, 2, device=device),
-        torch.tensor([0, 1, 2], device=device))
+        torch.tensor([10.0, 10.0, 5.0, 4.0], device=device),
+        ii.to(device),
+        jj.to(device),
+        target.to(device),
+        torch.ones(6, _H, _W, 2, device=device),
+        torch.tensor([0, 1, 2], device=device),
+    )
 
 
 def _without_edges(view: UncertaintyView) -> UncertaintyView:
-    return dataclasses.replace(view, ii=view.ii[:0], jj=view.jj[:0], target=view.target[:0],
-                               confidence=view.confidence[:0])
+    return dataclasses.replace(
+        view, ii=view.ii[:0], jj=view.jj[:0], target=view.target[:0], confidence=view.confidence[:0]
+    )

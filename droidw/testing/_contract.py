@@ -39,8 +39,14 @@ class Subject:
         folder: the run folder that the component is built for.
     """
 
-    def __init__(self, kind: str, component: Component[Any], device: str | torch.device,
-                 options: Any, folder: Path) -> None:
+    def __init__(
+        self,
+        kind: str,
+        component: Component[Any],
+        device: str | torch.device,
+        options: Any,
+        folder: Path,
+    ) -> None:
         self.noun = KINDS[kind].noun
         self.component = component
         self.device = torch.device(device)
@@ -78,32 +84,52 @@ class Subject:
         before = _random_states()
         with self.calling("the factory"):
             part = self.component.factory(options, context)
-        self.expect("own-generator", before == _random_states(),
-                    "building it draws from or seeds the global random generators; make a "
-                    "generator from `context.seed` instead")
+        self.expect(
+            "own-generator",
+            before == _random_states(),
+            "building it draws from or seeds the global random generators; make a "
+            "generator from `context.seed` instead",
+        )
         return part
 
     def follows(self, part: Any, protocol: type) -> None:
         """Clause `protocol`: all methods and attributes of the interface are there."""
-        self.expect("protocol", isinstance(part, protocol),
-                    f"what the factory returned ({type(part).__name__}) lacks a method or "
-                    f"attribute of {protocol.__module__}.{protocol.__qualname__}")
+        self.expect(
+            "protocol",
+            isinstance(part, protocol),
+            f"what the factory returned ({type(part).__name__}) lacks a method or "
+            f"attribute of {protocol.__module__}.{protocol.__qualname__}",
+        )
 
     def unchanged(self, what: str, before: Any, after: Any) -> None:
         """Clause `no-mutation`: an input has the value it had."""
         self.expect("no-mutation", same(before, after), f"{what} was changed")
 
-    def tensor(self, what: str, value: Any, shape: tuple[int, ...],
-               dtypes: tuple[torch.dtype, ...] = (torch.float32,)) -> None:
+    def tensor(
+        self,
+        what: str,
+        value: Any,
+        shape: tuple[int, ...],
+        dtypes: tuple[torch.dtype, ...] = (torch.float32,),
+    ) -> None:
         """Clauses `shape`, `dtype`, `device`, `finite` and `no-grad` of a returned tensor."""
-        self.expect("shape", isinstance(value, torch.Tensor),
-                    f"{what} is a {type(value).__name__}, not a tensor")
-        self.expect("shape", tuple(value.shape) == shape,
-                    f"{what} has shape {list(value.shape)} where {list(shape)} is due")
+        self.expect(
+            "shape",
+            isinstance(value, torch.Tensor),
+            f"{what} is a {type(value).__name__}, not a tensor",
+        )
+        self.expect(
+            "shape",
+            tuple(value.shape) == shape,
+            f"{what} has shape {list(value.shape)} where {list(shape)} is due",
+        )
         names = " or ".join(str(dtype) for dtype in dtypes)
         self.expect("dtype", value.dtype in dtypes, f"{what} is {value.dtype}, not {names}")
-        self.expect("device", value.device.type == self.device.type,
-                    f"{what} is on {value.device}, not on {self.device}")
+        self.expect(
+            "device",
+            value.device.type == self.device.type,
+            f"{what} is on {value.device}, not on {self.device}",
+        )
         self.expect("finite", bool(torch.isfinite(value).all()), f"{what} has NaN or inf")
         self.expect("no-grad", not value.requires_grad, f"{what} requires gradients")
 
@@ -112,29 +138,44 @@ class Subject:
         c = self.component
         self.expect("component", isinstance(c, Component), f"it is a {type(c).__name__}")
         self.expect("name", bool(_NAME.fullmatch(c.name)), "the name is not lower-case kebab")
-        self.expect("summary", bool(c.summary.strip()) and "\n" not in c.summary
-                    and len(c.summary) <= 120,
-                    "the summary must be one line of at most 120 characters")
-        self.expect("capabilities", bool({"cpu", "cuda"} & set(c.capabilities)),
-                    "capabilities must name a device: 'cpu', 'cuda' or both")
-        self.expect("extra", not c.extra or bool(c.requires),
-                    "an extra is named, but `requires` does not say what it installs")
+        self.expect(
+            "summary",
+            bool(c.summary.strip()) and "\n" not in c.summary and len(c.summary) <= 120,
+            "the summary must be one line of at most 120 characters",
+        )
+        self.expect(
+            "capabilities",
+            bool({"cpu", "cuda"} & set(c.capabilities)),
+            "capabilities must name a device: 'cpu', 'cuda' or both",
+        )
+        self.expect(
+            "extra",
+            not c.extra or bool(c.requires),
+            "an extra is named, but `requires` does not say what it installs",
+        )
         self._record_options()
         self._record_import()
 
     def _record_options(self) -> None:
         c = self.component
-        self.expect("options", isinstance(c.options, type) and dataclasses.is_dataclass(c.options),
-                    "`options` is not a dataclass")
+        self.expect(
+            "options",
+            isinstance(c.options, type) and dataclasses.is_dataclass(c.options),
+            "`options` is not a dataclass",
+        )
         for entry in dataclasses.fields(c.options):
-            has_default = (entry.default is not dataclasses.MISSING
-                           or entry.default_factory is not dataclasses.MISSING)
+            has_default = (
+                entry.default is not dataclasses.MISSING
+                or entry.default_factory is not dataclasses.MISSING
+            )
             self.expect("options", has_default, f"option '{entry.name}' has no default")
-            self.expect("options", bool(str(entry.metadata.get("help", "")).strip()),
-                        f"option '{entry.name}' has no help text (metadata={{'help': ...}})")
+            self.expect(
+                "options",
+                bool(str(entry.metadata.get("help", "")).strip()),
+                f"option '{entry.name}' has no help text (metadata={{'help': ...}})",
+            )
         with self.calling("making the default options"):
-            self.expect("options", c.options() == c.options(),
-                        "two sets of default options differ")
+            self.expect("options", c.options() == c.options(), "two sets of default options differ")
 
     def _record_import(self) -> None:
         """In a fresh interpreter, since everything may be loaded already in this one."""
@@ -154,13 +195,24 @@ class Subject:
         )
         # Not from the current folder: a test module is no plugin and may import what it likes.
         with tempfile.TemporaryDirectory() as folder:
-            done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True,
-                                  text=True, check=False, env=dict(os.environ))
-        self.expect("light-import", done.returncode == 0,
-                    f"module {module} cannot be imported: {done.stderr.strip()[-400:]}")
-        self.expect("light-import", not done.stdout.strip(),
-                    f"module {module} imports {done.stdout.strip()} at its top; import that in "
-                    "the factory")
+            done = subprocess.run(
+                [sys.executable, "-c", code],
+                cwd=folder,
+                capture_output=True,
+                text=True,
+                check=False,
+                env=dict(os.environ),
+            )
+        self.expect(
+            "light-import",
+            done.returncode == 0,
+            f"module {module} cannot be imported: {done.stderr.strip()[-400:]}",
+        )
+        self.expect(
+            "light-import",
+            not done.stdout.strip(),
+            f"module {module} imports {done.stdout.strip()} at its top; import that in the factory",
+        )
 
 
 def snapshot(value: Any) -> Any:
@@ -171,22 +223,35 @@ def snapshot(value: Any) -> Any:
 def same(first: Any, second: Any) -> bool:
     """Equal to the bit, through tensors, arrays, records, mappings and sequences; NaN is NaN."""
     if isinstance(first, torch.Tensor):
-        return (isinstance(second, torch.Tensor) and first.dtype == second.dtype
-                and first.shape == second.shape
-                and same(first.detach().cpu().numpy(), second.detach().cpu().numpy()))
+        return (
+            isinstance(second, torch.Tensor)
+            and first.dtype == second.dtype
+            and first.shape == second.shape
+            and same(first.detach().cpu().numpy(), second.detach().cpu().numpy())
+        )
     if isinstance(first, np.ndarray):
-        return (isinstance(second, np.ndarray) and first.dtype == second.dtype
-                and first.shape == second.shape and first.tobytes() == second.tobytes())
+        return (
+            isinstance(second, np.ndarray)
+            and first.dtype == second.dtype
+            and first.shape == second.shape
+            and first.tobytes() == second.tobytes()
+        )
     if dataclasses.is_dataclass(first) and not isinstance(first, type):
         return type(first) is type(second) and all(
-            same(getattr(first, f.name), getattr(second, f.name))
-            for f in dataclasses.fields(first))
+            same(getattr(first, f.name), getattr(second, f.name)) for f in dataclasses.fields(first)
+        )
     if isinstance(first, dict):
-        return (isinstance(second, dict) and first.keys() == second.keys()
-                and all(same(first[key], second[key]) for key in first))
+        return (
+            isinstance(second, dict)
+            and first.keys() == second.keys()
+            and all(same(first[key], second[key]) for key in first)
+        )
     if isinstance(first, (list, tuple)):
-        return (type(first) is type(second) and len(first) == len(second)
-                and all(same(a, b) for a, b in zip(first, second, strict=True)))
+        return (
+            type(first) is type(second)
+            and len(first) == len(second)
+            and all(same(a, b) for a, b in zip(first, second, strict=True))
+        )
     if isinstance(first, float) and isinstance(second, float) and first != first:
         return second != second
     return bool(first == second)

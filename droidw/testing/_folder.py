@@ -36,12 +36,20 @@ def write_scene(scene: Scene, folder: Path) -> None:
         poses.append(f"{frame.time:.6f} " + " ".join(f"{v:.9f}" for v in frame.T_wc))
     (folder / "rgb.txt").write_text("# timestamp filename\n" + "\n".join(stamps) + "\n")
     (folder / "groundtruth.txt").write_text(
-        "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(poses) + "\n")
+        "# timestamp tx ty tz qx qy qz qw\n" + "\n".join(poses) + "\n"
+    )
     fx, fy, cx, cy = (float(v) for v in scene.intrinsics)
-    values = {"width": scene.spec.width, "height": scene.spec.height,
-              "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    values = {
+        "width": scene.spec.width,
+        "height": scene.spec.height,
+        "fx": fx,
+        "fy": fy,
+        "cx": cx,
+        "cy": cy,
+    }
     (folder / "camera.txt").write_text(
-        "".join(f"{key} {value:.10g}\n" for key, value in values.items()))
+        "".join(f"{key} {value:.10g}\n" for key, value in values.items())
+    )
 
 
 def _write(path: Path, image: np.ndarray[tuple[int, ...], np.dtype[np.uint8 | np.uint16]]) -> None:

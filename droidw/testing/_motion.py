@@ -68,11 +68,13 @@ def _shake(t: float, phases: Array) -> tuple[Array, Array]:
 
 def _handheld(t: float, phases: Array) -> Pose:
     shift, turn = _shake(t, phases)
-    centre = np.array([
-        _wave(t, 0.60, 0.17, phases[6]) + _wave(t, 0.10, 0.43, phases[7]),
-        _wave(t, 0.16, 0.29, phases[8]) - 0.05,
-        _wave(t, 0.35, 0.13, phases[9]) - 1.05,
-    ])
+    centre = np.array(
+        [
+            _wave(t, 0.60, 0.17, phases[6]) + _wave(t, 0.10, 0.43, phases[7]),
+            _wave(t, 0.16, 0.29, phases[8]) - 0.05,
+            _wave(t, 0.35, 0.13, phases[9]) - 1.05,
+        ]
+    )
     # The camera looks at a point that wanders, so rotation partly follows translation.
     yaw = -0.16 * centre[0] + _wave(t, 0.16, 0.19, phases[10])
     pitch = 0.04 + _wave(t, 0.06, 0.23, phases[11])
@@ -83,9 +85,9 @@ def _handheld(t: float, phases: Array) -> Pose:
 def _orbit(t: float, phases: Array) -> Pose:
     angle = _wave(t, 0.42, 0.11, phases[6])
     radius = 3.0 + _wave(t, 0.15, 0.17, phases[7])
-    centre = np.array([
-        -radius * sin(angle), _wave(t, 0.15, 0.21, phases[8]), 1.9 - radius * cos(angle)
-    ])
+    centre = np.array(
+        [-radius * sin(angle), _wave(t, 0.15, 0.21, phases[8]), 1.9 - radius * cos(angle)]
+    )
     return Pose(rotation(angle, 0.06 - 0.2 * centre[1], 0.0), centre)
 
 
@@ -97,8 +99,10 @@ def _forward(t: float, phases: Array) -> Pose:
 
 def _rotation(t: float, phases: Array) -> Pose:
     yaw = _wave(t, 0.35, 0.12, phases[6])
-    return Pose(rotation(yaw, 0.04 + _wave(t, 0.08, 0.2, phases[7]), _wave(t, 0.05, 0.26, 0)),
-                np.array([0.0, -0.05, -1.0]))
+    return Pose(
+        rotation(yaw, 0.04 + _wave(t, 0.08, 0.2, phases[7]), _wave(t, 0.05, 0.26, 0)),
+        np.array([0.0, -0.05, -1.0]),
+    )
 
 
 def _static(t: float, phases: Array) -> Pose:
@@ -122,15 +126,19 @@ def camera_path(motion: str, t: float, phases: Array) -> Pose:
 def actor_path(kind: str, t: float, phases: Array, height: float, floor: float) -> Pose:
     """Object to world at time `t`: a "walker" that strides over the floor, or a "ball"."""
     if kind == "walker":
-        centre = np.array([
-            _wave(t, 0.75, 0.21, phases[0]),
-            floor - height / 2 - 0.03 * abs(sin(2 * pi * 0.9 * t)),
-            1.05 + _wave(t, 0.25, 0.16, phases[1]),
-        ])
+        centre = np.array(
+            [
+                _wave(t, 0.75, 0.21, phases[0]),
+                floor - height / 2 - 0.03 * abs(sin(2 * pi * 0.9 * t)),
+                1.05 + _wave(t, 0.25, 0.16, phases[1]),
+            ]
+        )
         return Pose(rotation(_wave(t, 0.7, 0.17, phases[2]), 0.0, _wave(t, 0.05, 0.9, 0)), centre)
-    centre = np.array([
-        _wave(t, 0.70, 0.27, phases[0]),
-        0.15 - 0.7 * abs(sin(2 * pi * 0.38 * t + phases[1])),
-        0.85 + _wave(t, 0.2, 0.2, phases[2]),
-    ])
+    centre = np.array(
+        [
+            _wave(t, 0.70, 0.27, phases[0]),
+            0.15 - 0.7 * abs(sin(2 * pi * 0.38 * t + phases[1])),
+            0.85 + _wave(t, 0.2, 0.2, phases[2]),
+        ]
+    )
     return Pose(rotation(1.3 * t, 0.9 * t, 0.0), centre)

@@ -25,8 +25,10 @@ UV_AXES = ((2, 1), (0, 2), (0, 1))
 def face_size(half: Array, face: int) -> tuple[int, int]:
     """Height and width in texels of face `2 * axis + (1 if the positive side)`."""
     u, v = UV_AXES[face // 2]
-    return (max(8, int(np.ceil(2 * half[v] / TEXEL)) + 1),
-            max(8, int(np.ceil(2 * half[u] / TEXEL)) + 1))
+    return (
+        max(8, int(np.ceil(2 * half[v] / TEXEL)) + 1),
+        max(8, int(np.ceil(2 * half[u] / TEXEL)) + 1),
+    )
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,9 @@ class Body:
             axis = np.argmin(far, axis=0)
             return _pick(far, axis), 2 * axis + _pick(ahead, axis)
         near = (np.where(ahead, -half[:, None], half[:, None]) - origin[:, None]) * inverse
-        near = np.where(rays == 0, np.where(np.abs(origin)[:, None] < half[:, None],
-                                            -np.inf, np.inf), near)
+        near = np.where(
+            rays == 0, np.where(np.abs(origin)[:, None] < half[:, None], -np.inf, np.inf), near
+        )
         axis = np.argmax(near, axis=0)
         enter = _pick(near, axis)
         hit = (enter < far.min(axis=0)) & (enter > 0)
@@ -123,8 +126,9 @@ class Hits:
     slant: Array
 
 
-def cast(bodies: list[Body], poses: list[Pose], camera: Pose, intrinsics: Array, x: Array,
-         y: Array) -> Hits:
+def cast(
+    bodies: list[Body], poses: list[Pose], camera: Pose, intrinsics: Array, x: Array, y: Array
+) -> Hits:
     """Cast rays through pixel positions x, y [N] (pixel centres at integers).
 
     Args:
@@ -136,8 +140,13 @@ def cast(bodies: list[Body], poses: list[Pose], camera: Pose, intrinsics: Array,
     rays_c = np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)])
     length = np.sqrt(rays_c[0] ** 2 + rays_c[1] ** 2 + 1)
     count = len(x)
-    hits = Hits(np.full(count, np.inf, dtype), np.full(count, -1, np.int16),
-                np.zeros(count, np.int16), np.zeros((3, count), dtype), np.ones(count, dtype))
+    hits = Hits(
+        np.full(count, np.inf, dtype),
+        np.full(count, -1, np.int16),
+        np.zeros(count, np.int16),
+        np.zeros((3, count), dtype),
+        np.ones(count, dtype),
+    )
     for number, (body, pose) in enumerate(zip(bodies, poses, strict=True)):
         chosen = _candidates(body, pose, camera, intrinsics, x, y)
         if chosen is not None and len(chosen) == 0:
@@ -165,8 +174,9 @@ def cast(bodies: list[Body], poses: list[Pose], camera: Pose, intrinsics: Array,
     return hits
 
 
-def _candidates(body: Body, pose: Pose, camera: Pose, intrinsics: Array, x: Array,
-                y: Array) -> npt.NDArray[np.intp] | None:
+def _candidates(
+    body: Body, pose: Pose, camera: Pose, intrinsics: Array, x: Array, y: Array
+) -> npt.NDArray[np.intp] | None:
     """Rays that may hit the body: those in the projected cube of its bounding ball; None: all."""
     if body.kind == "room":
         return None
@@ -179,8 +189,11 @@ def _candidates(body: Body, pose: Pose, camera: Pose, intrinsics: Array, x: Arra
     fx, fy, cx, cy = intrinsics
     spans = []
     for c, f, p in ((centre[0], fx, cx), (centre[1], fy, cy)):
-        ends = [f * (c + side * r) / (centre[2] + depth * r) + p
-                for side in (-1, 1) for depth in (-1, 1)]
+        ends = [
+            f * (c + side * r) / (centre[2] + depth * r) + p
+            for side in (-1, 1)
+            for depth in (-1, 1)
+        ]
         spans.append((min(ends), max(ends)))
     (left, right), (top, bottom) = spans
     return np.flatnonzero((x >= left) & (x <= right) & (y >= top) & (y <= bottom))

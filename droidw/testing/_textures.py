@@ -18,8 +18,15 @@ _PAD = 8
 _SHELF = 2048
 
 
-def noise(rng: np.random.Generator, height: int, width: int, cell: float, octaves: int,
-          gain: float = 0.6, channels: int = 1) -> Image:
+def noise(
+    rng: np.random.Generator,
+    height: int,
+    width: int,
+    cell: float,
+    octaves: int,
+    gain: float = 0.6,
+    channels: int = 1,
+) -> Image:
     """Multi-octave value noise [height,width,channels], zero mean, largest cell `cell` texels."""
     total = np.zeros((height, width, channels), dtype=np.float32)
     amplitude = 1.0
@@ -65,8 +72,14 @@ def _poster(rng: np.random.Generator, height: int, width: int) -> Image:
         size = int(rng.integers(4, max(6, min(height, width) // 4)))
         kind = rng.integers(0, 3)
         if kind == 0:
-            cv2.rectangle(image, (x, y), (x + size, y + int(size * rng.uniform(0.4, 1.6))),
-                          colour, -1, cv2.LINE_AA)
+            cv2.rectangle(
+                image,
+                (x, y),
+                (x + size, y + int(size * rng.uniform(0.4, 1.6))),
+                colour,
+                -1,
+                cv2.LINE_AA,
+            )
         elif kind == 1:
             cv2.circle(image, (x, y), size // 2 + 2, colour, -1, cv2.LINE_AA)
         else:
@@ -87,7 +100,7 @@ def wall(rng: np.random.Generator, height: int, width: int) -> Image:
         h, w = int(rng.integers(50, 130)), int(rng.integers(45, 140))
         y = int(rng.integers(8, max(9, height * 3 // 4 - h)))
         x = int(rng.integers(4, max(5, width - w - 4)))
-        part = image[y:y + h, x:x + w]
+        part = image[y : y + h, x : x + w]
         part[:] = _poster(rng, *part.shape[:2])
     image[-14:] = _colour(rng, 50, 90, 10)
     return _soften(image * _corner_shade(height, width))
@@ -102,11 +115,11 @@ def planks(rng: np.random.Generator, height: int, width: int) -> Image:
         x = -int(rng.integers(0, 200))
         while x < width:
             length = int(rng.integers(140, 300))
-            image[y:y + board, max(x, 0):x + length] = base * rng.uniform(0.72, 1.2)
+            image[y : y + board, max(x, 0) : x + length] = base * rng.uniform(0.72, 1.2)
             if x > 0:
-                image[y:y + board, x:x + 2] *= 0.5
+                image[y : y + board, x : x + 2] *= 0.5
             x += length
-        image[y:y + 2] *= 0.5
+        image[y : y + 2] *= 0.5
     short = noise(rng, height, width // 5 + 1, 14, 4, 0.8)
     grain = cv2.resize(short, (width, height), interpolation=cv2.INTER_CUBIC)
     image *= (1 + 0.30 * grain[..., None]).astype(np.float32)
@@ -120,9 +133,9 @@ def plain(rng: np.random.Generator, height: int, width: int) -> Image:
     image[:] = _colour(rng, 185, 215, 6)
     image += 12 * noise(rng, height, width, 90, 3)
     for x in range(100, width, 190):
-        image[:, x:x + 3] -= 26
+        image[:, x : x + 3] -= 26
     for y in range(100, height, 190):
-        image[y:y + 3] -= 26
+        image[y : y + 3] -= 26
     return _soften(image * _corner_shade(height, width))
 
 
@@ -133,13 +146,13 @@ def furniture(rng: np.random.Generator, height: int, width: int) -> Image:
     image += 40 * noise(rng, height, width, 40, 4, 0.7)
     step = int(rng.integers(34, 70))
     for y in range(0, height, step):
-        image[y:y + 3] *= 0.55
+        image[y : y + 3] *= 0.55
     for x in range(0, width, step):
-        image[:, x:x + 3] *= 0.55
+        image[:, x : x + 3] *= 0.55
     for _ in range(max(1, height * width // 7000)):
         h, w = int(rng.integers(12, 40)), int(rng.integers(12, 45))
         y, x = int(rng.integers(0, max(1, height - h))), int(rng.integers(0, max(1, width - w)))
-        part = image[y:y + h, x:x + w]
+        part = image[y : y + h, x : x + w]
         part[:] = _poster(rng, *part.shape[:2])
     return _soften(image)
 
@@ -157,13 +170,22 @@ def fabric(rng: np.random.Generator, height: int, width: int) -> Image:
     image += 18 * noise(rng, height, width, 40, 2, 0.6, 3)
     for _ in range(max(3, height * width // 1500)):
         centre = int(rng.integers(0, width)), int(rng.integers(0, height))
-        cv2.circle(image, centre, int(rng.integers(3, 9)), _colour(rng, 10, 240, 50).tolist(), -1,
-                   cv2.LINE_AA)
+        cv2.circle(
+            image,
+            centre,
+            int(rng.integers(3, 9)),
+            _colour(rng, 10, 240, 50).tolist(),
+            -1,
+            cv2.LINE_AA,
+        )
     return _soften(image.astype(np.float32))
 
 
-def paint_box(paint: Callable[[np.random.Generator, int, int], Image], rng: np.random.Generator,
-              sizes: list[tuple[int, int]]) -> list[Image]:
+def paint_box(
+    paint: Callable[[np.random.Generator, int, int], Image],
+    rng: np.random.Generator,
+    sizes: list[tuple[int, int]],
+) -> list[Image]:
     """Six faces (height, width) painted by `paint`, each a little brighter or darker."""
     shades = (0.86, 0.94, 1.08, 0.7, 1.0, 0.9)
     return [paint(rng, h, w) * shade for (h, w), shade in zip(sizes, shades, strict=True)]
@@ -200,9 +222,14 @@ class Atlas:
         base = np.zeros((height, width, 3), np.uint8)
         for tile, (x, y, w, h) in zip(tiles, places, strict=True):
             filled = np.clip(np.rint(tile), 0, 255).astype(np.uint8)
-            base[y:y + h, x:x + w] = cv2.copyMakeBorder(
-                filled, _PAD, h - _PAD - tile.shape[0], _PAD, w - _PAD - tile.shape[1],
-                cv2.BORDER_REPLICATE)
+            base[y : y + h, x : x + w] = cv2.copyMakeBorder(
+                filled,
+                _PAD,
+                h - _PAD - tile.shape[0],
+                _PAD,
+                w - _PAD - tile.shape[1],
+                cv2.BORDER_REPLICATE,
+            )
         levels = [base]
         for _ in range(LEVELS - 1):
             size = levels[-1].shape[1] // 2, levels[-1].shape[0] // 2
@@ -210,7 +237,7 @@ class Atlas:
         columns = np.cumsum([0] + [level.shape[1] for level in levels])
         pixels = np.zeros((height, int(columns[-1]), 3), np.uint8)
         for level, column in zip(levels, columns[:-1], strict=True):
-            pixels[: level.shape[0], column:column + level.shape[1]] = level
+            pixels[: level.shape[0], column : column + level.shape[1]] = level
         origins = np.array([(x + _PAD, y + _PAD) for x, y, _, _ in places], np.float32)
         return Atlas(pixels, columns[:-1].astype(np.float32), origins)
 

@@ -61,8 +61,13 @@ __all__ = [
 ]
 
 
-def _run(kind: str, component: Component[Any], device: str | torch.device, options: Any,
-         suite: Callable[[Subject], None] | None) -> None:
+def _run(
+    kind: str,
+    component: Component[Any],
+    device: str | torch.device,
+    options: Any,
+    suite: Callable[[Subject], None] | None,
+) -> None:
     with tempfile.TemporaryDirectory() as folder:
         subject = Subject(kind, component, device, options, Path(folder))
         subject.record()
@@ -82,8 +87,9 @@ def check_component(kind: str, component: Component[Any]) -> None:
     _run(kind, component, "cpu", None, None)
 
 
-def check_feature_extractor(component: Component[Any], device: str | torch.device = "cpu",
-                            options: Any = None) -> None:
+def check_feature_extractor(
+    component: Component[Any], device: str | torch.device = "cpu", options: Any = None
+) -> None:
     """Hold a feature extractor against `droidw.interfaces.features`.
 
     Clauses beside those of the module: `dim` is a number >= 0 and `capability` "features" is
@@ -96,8 +102,9 @@ def check_feature_extractor(component: Component[Any], device: str | torch.devic
     _run("features", component, device, options, _check_maps.feature_extractor)
 
 
-def check_depth_prior(component: Component[Any], device: str | torch.device = "cpu",
-                      options: Any = None) -> None:
+def check_depth_prior(
+    component: Component[Any], device: str | torch.device = "cpu", options: Any = None
+) -> None:
     """Hold a depth prior against `droidw.interfaces.depth`.
 
     Clauses: `metric` is a bool; `predict` gives None or a `DepthMap` of [H,W] float32 for even
@@ -110,8 +117,9 @@ def check_depth_prior(component: Component[Any], device: str | torch.device = "c
     _run("depth", component, device, options, _check_maps.depth_prior)
 
 
-def check_uncertainty_model(component: Component[Any], device: str | torch.device = "cpu",
-                            options: Any = None) -> None:
+def check_uncertainty_model(
+    component: Component[Any], device: str | torch.device = "cpu", options: Any = None
+) -> None:
     """Hold an uncertainty model against `droidw.interfaces.uncertainty`.
 
     Clauses: `fields` are `StoreField`s of distinct names; `append` and `update` write finite maps
@@ -126,8 +134,9 @@ def check_uncertainty_model(component: Component[Any], device: str | torch.devic
     _run("uncertainty", component, device, options, _check_uncertainty.uncertainty_model)
 
 
-def check_bundle_adjuster(component: Component[Any], device: str | torch.device = "cpu",
-                          options: Any = None) -> None:
+def check_bundle_adjuster(
+    component: Component[Any], device: str | torch.device = "cpu", options: Any = None
+) -> None:
     """Hold a bundle adjustment backend against `droidw.interfaces.bundle`.
 
     Clauses: `fresh` tensors; `fixed` poses and `isolated` ones do not move; `unit` quaternions;
@@ -146,8 +155,9 @@ check_ba_backend = check_bundle_adjuster
 """`check_bundle_adjuster` under the name of its hook."""
 
 
-def check_correspondence(component: Component[Any], device: str | torch.device = "cpu",
-                         options: Any = None) -> None:
+def check_correspondence(
+    component: Component[Any], device: str | torch.device = "cpu", options: Any = None
+) -> None:
     """Hold a correspondence operator against `droidw.interfaces.correspondence`.
 
     Clauses: `grid` is possible; confidence >= 0 (`range`); answers in the `order` of the request,
@@ -162,8 +172,9 @@ def check_correspondence(component: Component[Any], device: str | torch.device =
     _run("correspondence", component, device, options, _check_correspondence.correspondence)
 
 
-def check_dataset_reader(component: Component[Any], source: str,
-                         device: str | torch.device = "cpu", options: Any = None) -> None:
+def check_dataset_reader(
+    component: Component[Any], source: str, device: str | torch.device = "cpu", options: Any = None
+) -> None:
     """Hold a dataset reader against `droidw.interfaces.datasets`.
 
     Clauses: `recognises` its source and nothing else; `frames` are `RawFrame`s of uint8 [H,W,3],
@@ -180,12 +191,18 @@ def check_dataset_reader(component: Component[Any], source: str,
     Raises:
         AssertionError: a clause does not hold.
     """
-    _run("reader", component, device, options,
-         lambda subject: _check_files.dataset_reader(subject, source))
+    _run(
+        "reader",
+        component,
+        device,
+        options,
+        lambda subject: _check_files.dataset_reader(subject, source),
+    )
 
 
-def check_exporter(component: Component[Any], device: str | torch.device = "cpu",
-                   options: Any = None) -> None:
+def check_exporter(
+    component: Component[Any], device: str | torch.device = "cpu", options: Any = None
+) -> None:
     """Hold an exporter against `droidw.interfaces.exporters`.
 
     Clauses: `files`: the paths returned are exactly the files written; `folder`: nothing is
@@ -198,8 +215,9 @@ def check_exporter(component: Component[Any], device: str | torch.device = "cpu"
     _run("exporter", component, device, options, _check_files.exporter)
 
 
-def check_observer(component: Component[Any], device: str | torch.device = "cpu",
-                   options: Any = None) -> None:
+def check_observer(
+    component: Component[Any], device: str | torch.device = "cpu", options: Any = None
+) -> None:
     """Hold an observer against `droidw.interfaces.observers`.
 
     Clauses: it takes every event in the order of a run, of unknown length and without keyframes,
@@ -212,8 +230,13 @@ def check_observer(component: Component[Any], device: str | torch.device = "cpu"
     _run("observer", component, device, options, _check_files.observer)
 
 
-def check(kind: str, component: Component[Any], device: str | torch.device = "cpu",
-          options: Any = None, source: str | None = None) -> None:
+def check(
+    kind: str,
+    component: Component[Any],
+    device: str | torch.device = "cpu",
+    options: Any = None,
+    source: str | None = None,
+) -> None:
     """Run the suite of a kind (a key of `droidw.plugin.registry.KINDS`).
 
     Args:
@@ -228,8 +251,9 @@ def check(kind: str, component: Component[Any], device: str | torch.device = "cp
     """
     if kind == "reader":
         if source is None:
-            raise UsageError("a dataset reader cannot be checked without footage",
-                             "give source=PATH")
+            raise UsageError(
+                "a dataset reader cannot be checked without footage", "give source=PATH"
+            )
         check_dataset_reader(component, source, device, options)
         return
     suites: dict[str, Callable[..., None]] = {
@@ -242,6 +266,7 @@ def check(kind: str, component: Component[Any], device: str | torch.device = "cp
         "observer": check_observer,
     }
     if kind not in suites:
-        raise UsageError(f"there is no kind of plugin called '{kind}'",
-                         "kinds: " + ", ".join(KINDS))
+        raise UsageError(
+            f"there is no kind of plugin called '{kind}'", "kinds: " + ", ".join(KINDS)
+        )
     suites[kind](component, device, options)

@@ -48,6 +48,7 @@ SCENES: dict[str, tuple[str, bool]] = {
 }
 """Scenes by name: the camera path, and whether objects move."""
 
+
 @dataclass(frozen=True)
 class SceneSpec:
     """What to render; equal specs give equal bytes.
@@ -74,20 +75,31 @@ class SceneSpec:
 
     def __post_init__(self) -> None:
         if self.motion not in CAMERA_PATHS:
-            raise UsageError(f"scene: motion '{self.motion}' is not known",
-                             "available: " + ", ".join(MOTIONS))
+            raise UsageError(
+                f"scene: motion '{self.motion}' is not known", "available: " + ", ".join(MOTIONS)
+            )
         if self.width < 16 or self.height < 16:
-            raise UsageError(f"scene: size {self.width}x{self.height} is too small",
-                             "use at least 16x16 pixels")
+            raise UsageError(
+                f"scene: size {self.width}x{self.height} is too small", "use at least 16x16 pixels"
+            )
         if self.frames < 1 or self.fps <= 0 or self.seed < 0 or self.noise < 0 or self.focal <= 0:
             raise UsageError(
                 "scene: frames >= 1, fps > 0, seed >= 0, noise >= 0 and focal > 0 are needed, got "
                 f"frames={self.frames}, fps={self.fps}, seed={self.seed}, noise={self.noise}, "
-                f"focal={self.focal}")
+                f"focal={self.focal}"
+            )
 
 
-def named_spec(name: str, *, width: int = 320, height: int = 240, frames: int = 60,
-               fps: float = 30.0, seed: int = 0, noise: float = 1.5) -> SceneSpec:
+def named_spec(
+    name: str,
+    *,
+    width: int = 320,
+    height: int = 240,
+    frames: int = 60,
+    fps: float = 30.0,
+    seed: int = 0,
+    noise: float = 1.5,
+) -> SceneSpec:
     """The spec of a scene in `SCENES`, such as "handheld" or "orbit-no-moving".
 
     Raises:
@@ -156,8 +168,14 @@ class Scene:
         for body in self._bodies:
             sizes = [face_size(body.half, face) for face in range(6)]
             if body.kind == "room":
-                paints = [textures.wall, textures.wall, textures.plain, textures.planks,
-                          textures.wall, textures.wall]
+                paints = [
+                    textures.wall,
+                    textures.wall,
+                    textures.plain,
+                    textures.planks,
+                    textures.wall,
+                    textures.wall,
+                ]
                 tiles += [paint(rng, h, w) for paint, (h, w) in zip(paints, sizes, strict=True)]
             else:
                 paint = textures.fabric if body.actor else textures.furniture
@@ -200,8 +218,10 @@ class Scene:
     def trajectory(self) -> Trajectory:
         """True poses of all frames."""
         indices = range(len(self))
-        return Trajectory(np.array([self.time(k) for k in indices], dtype=np.float64),
-                          np.stack([self.T_wc(k) for k in indices]))
+        return Trajectory(
+            np.array([self.time(k) for k in indices], dtype=np.float64),
+            np.stack([self.T_wc(k) for k in indices]),
+        )
 
     def render(self, index: int) -> SceneFrame:
         """Picture and truth of one frame.
@@ -217,22 +237,28 @@ class Scene:
         fine_y, fine_x = np.mgrid[: 2 * spec.height, : 2 * spec.width].astype(np.float32)
         fine = self._cast(index, (fine_x.ravel() - 0.5) / 2, (fine_y.ravel() - 0.5) / 2)
         colour = self._shade(fine).reshape(2 * spec.height, 2 * spec.width, 3)
-        image = np.asarray(cv2.resize(colour, (spec.width, spec.height),
-                                      interpolation=cv2.INTER_AREA))
+        image = np.asarray(
+            cv2.resize(colour, (spec.width, spec.height), interpolation=cv2.INTER_AREA)
+        )
         if spec.noise > 0:
             rng = np.random.default_rng([spec.seed, 29, index])
             image = image + spec.noise * rng.standard_normal(image.shape, dtype=np.float32)
         shape = spec.height, spec.width
         return SceneFrame(
-            index, self.time(index), np.clip(np.rint(image), 0, 255).astype(np.uint8),
-            truth.depth.reshape(shape).astype(np.float32), self.T_wc(index),
-            self._actors(truth).reshape(shape) > 0)
+            index,
+            self.time(index),
+            np.clip(np.rint(image), 0, 255).astype(np.uint8),
+            truth.depth.reshape(shape).astype(np.float32),
+            self.T_wc(index),
+            self._actors(truth).reshape(shape) > 0,
+        )
 
     def depth_at(self, index: int, pixels: Floats) -> Floats:
         """Exact depth [...] in metres at pixel positions [...,2] of a frame."""
         flat = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-        return np.asarray(self._cast(index, flat[:, 0], flat[:, 1]).depth,
-                          dtype=np.float64).reshape(pixels.shape[:-1])
+        return np.asarray(
+            self._cast(index, flat[:, 0], flat[:, 1]).depth, dtype=np.float64
+        ).reshape(pixels.shape[:-1])
 
     def correspond(self, i: int, j: int, pixels: Floats) -> Correspondences:
         """Where the surface points at `pixels` [...,2] of frame i lie in frame j.
@@ -260,8 +286,11 @@ class Scene:
         there = self._cast(j, target[:, 0], target[:, 1])
         visible = front & inside & (np.abs(there.depth - z) < 1e-4 * z)
         shape = pixels.shape[:-1]
-        return Correspondences(target.reshape(*shape, 2), visible.reshape(shape),
-                               (self._actors(hits) > 0).reshape(shape))
+        return Correspondences(
+            target.reshape(*shape, 2),
+            visible.reshape(shape),
+            (self._actors(hits) > 0).reshape(shape),
+        )
 
     def flow(self, i: int, j: int) -> tuple[Floats, npt.NDArray[np.bool_]]:
         """For every pixel of i: its place in j [H,W,2] in pixels, and whether it is visible."""
@@ -281,8 +310,9 @@ class Scene:
 
     def _check(self, index: int) -> None:
         if not 0 <= index < len(self):
-            raise UsageError(f"scene: there is no frame {index}",
-                             f"frames go from 0 to {len(self) - 1}")
+            raise UsageError(
+                f"scene: there is no frame {index}", f"frames go from 0 to {len(self) - 1}"
+            )
 
     def _camera_pose(self, index: int) -> Pose:
         return camera_path(self.spec.motion, self.time(index), self._phases)
@@ -293,14 +323,20 @@ class Scene:
         for body, rest in zip(self._bodies, self._rest, strict=True):
             if body.actor:
                 kind = "ball" if body.kind == "ball" else "walker"
-                rest = actor_path(kind, self.time(index), self._actor_phases[body.actor - 1],
-                                  float(2 * body.half[1]), FLOOR)
+                rest = actor_path(
+                    kind,
+                    self.time(index),
+                    self._actor_phases[body.actor - 1],
+                    float(2 * body.half[1]),
+                    FLOOR,
+                )
             poses.append(rest)
         return poses
 
     def _cast(self, index: int, x: npt.NDArray[np.floating], y: npt.NDArray[np.floating]) -> Hits:
-        return cast(self._bodies, self._poses(index), self._camera_pose(index), self.intrinsics,
-                    x, y)
+        return cast(
+            self._bodies, self._poses(index), self._camera_pose(index), self.intrinsics, x, y
+        )
 
     def _actors(self, hits: Hits) -> npt.NDArray[np.int64]:
         """[N] number of the moving object that was hit, 0 for what is static."""

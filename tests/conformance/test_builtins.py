@@ -30,8 +30,12 @@ def footage(tmp_path_factory):
     for index in range(len(scene)):
         writer.write(np.ascontiguousarray(scene.render(index).image[..., ::-1]))
     writer.release()
-    return {"folder": str(root / "clip"), "tum": str(tum), "video": str(root / "clip.avi"),
-            "synthetic": "synthetic:orbit"}
+    return {
+        "folder": str(root / "clip"),
+        "tum": str(tum),
+        "video": str(root / "clip.avi"),
+        "synthetic": "synthetic:orbit",
+    }
 
 
 def skip_unless_ready(entry):
@@ -62,5 +66,13 @@ def test_reader_keeps_the_contract(name, footage):
 
 def test_all_kinds_have_built_ins():
     kinds = {e.kind for e in ENTRIES}
-    assert kinds == {"features", "depth", "uncertainty", "ba", "correspondence", "reader",
-                     "exporter", "observer"}
+    assert kinds == {
+        "features",
+        "depth",
+        "uncertainty",
+        "ba",
+        "correspondence",
+        "reader",
+        "exporter",
+        "observer",
+    }

@@ -24,8 +24,12 @@ from droidw_plugins.datasets.synthetic import COMPONENT as READER
 
 def component(part, **changes):
     """A component whose factory makes `part()`."""
-    given = {"name": "made-up", "summary": "a part of this test",
-             "factory": lambda options, context: part(), **changes}
+    given = {
+        "name": "made-up",
+        "summary": "a part of this test",
+        "factory": lambda options, context: part(),
+        **changes,
+    }
     return Component(**given)
 
 
@@ -74,16 +78,19 @@ def test_a_right_extractor_passes():
     conformance.check_feature_extractor(component(Mean, capabilities=FEATURES))
 
 
-@pytest.mark.parametrize(("clause", "change"), [
-    ("shape", lambda f, image, grid: f[:2]),
-    ("shape", lambda f, image, grid: f.transpose(1, 2)),
-    ("dtype", lambda f, image, grid: f.double()),
-    ("finite", lambda f, image, grid: f / (image.amax() > 0)),
-    ("no-grad", lambda f, image, grid: f.clone().requires_grad_()),
-    ("no-mutation", mutate),
-    ("deterministic", draw_at_random),
-    ("errors", raise_for_odd),
-])
+@pytest.mark.parametrize(
+    ("clause", "change"),
+    [
+        ("shape", lambda f, image, grid: f[:2]),
+        ("shape", lambda f, image, grid: f.transpose(1, 2)),
+        ("dtype", lambda f, image, grid: f.double()),
+        ("finite", lambda f, image, grid: f / (image.amax() > 0)),
+        ("no-grad", lambda f, image, grid: f.clone().requires_grad_()),
+        ("no-mutation", mutate),
+        ("deterministic", draw_at_random),
+        ("errors", raise_for_odd),
+    ],
+)
 def test_extractor_faults_are_caught(clause, change):
     broken(clause, "features", extractor(change))
 
@@ -104,8 +111,9 @@ def test_missing_method_is_caught():
     class Half:
         dim = 3
 
-    assert "FeatureExtractor" in broken("protocol", "features",
-                                        component(Half, capabilities=FEATURES))
+    assert "FeatureExtractor" in broken(
+        "protocol", "features", component(Half, capabilities=FEATURES)
+    )
 
 
 @dataclass(frozen=True)
@@ -118,16 +126,19 @@ class Required:
     scale: float = field(metadata={"help": "a factor"})
 
 
-@pytest.mark.parametrize(("clause", "changes"), [
-    ("name", {"name": "Made_Up"}),
-    ("summary", {"summary": "two\nlines"}),
-    ("summary", {"summary": ""}),
-    ("capabilities", {"capabilities": frozenset({"features"})}),
-    ("options", {"options": Helpless}),
-    ("options", {"options": Required}),
-    ("options", {"options": dict}),
-    ("extra", {"extra": "net"}),
-])
+@pytest.mark.parametrize(
+    ("clause", "changes"),
+    [
+        ("name", {"name": "Made_Up"}),
+        ("summary", {"summary": "two\nlines"}),
+        ("summary", {"summary": ""}),
+        ("capabilities", {"capabilities": frozenset({"features"})}),
+        ("options", {"options": Helpless}),
+        ("options", {"options": Required}),
+        ("options", {"options": dict}),
+        ("extra", {"extra": "net"}),
+    ],
+)
 def test_record_faults_are_caught_before_anything_is_built(clause, changes):
     def factory(options, context):
         raise AssertionError("the factory was called")
@@ -219,13 +230,20 @@ def test_uncertainty_faults_are_caught():
         fields = (StoreField("a", ("h", "w")), StoreField("a", ("c",)))
 
     conformance.check_uncertainty_model(component(Constant))
-    for clause, part in (("range", Negative), ("only-asked", Everywhere), ("finite", Dividing),
-                         ("no-mutation", Spoiling), ("state", Forgetful), ("fields", Doubled)):
+    for clause, part in (
+        ("range", Negative),
+        ("only-asked", Everywhere),
+        ("finite", Dividing),
+        ("no-mutation", Spoiling),
+        ("state", Forgetful),
+        ("fields", Doubled),
+    ):
         broken(clause, "uncertainty", component(part))
 
 
 def solver(change):
     """The torch backend with its step changed by `change(problem, step, part)`."""
+
     class Changed:
         def __init__(self):
             self.part = TORCH_BA.factory(TORCH_BA.options(), None)
@@ -261,9 +279,14 @@ def test_bundle_faults_are_caught():
             return step
         return Step(problem.T_cw * float("nan"), problem.disps.clone(), Report("ok", 1.0))
 
-    for clause, change in (("converges", frozen), ("unit|fixed", moves_fixed),
-                           ("no-mutation", in_place), ("fresh", shares),
-                           ("motion-only", moves_depth), ("finite", poisoned)):
+    for clause, change in (
+        ("converges", frozen),
+        ("unit|fixed", moves_fixed),
+        ("no-mutation", in_place),
+        ("fresh", shares),
+        ("motion-only", moves_depth),
+        ("finite", poisoned),
+    ):
         made = solver(change)
         with pytest.raises(AssertionError, match=f"breaks clause '({clause})'"):
             conformance.check_ba_backend(made)
@@ -304,13 +327,16 @@ def reversed_answers(request, update):
     return EdgeUpdate(update.target[order], update.confidence[order])
 
 
-@pytest.mark.parametrize(("clause", "change"), [
-    ("shape", lambda r, u: EdgeUpdate(u.target[..., 0], u.confidence)),
-    ("range", lambda r, u: EdgeUpdate(u.target, u.confidence - 1)),
-    ("accuracy", lambda r, u: EdgeUpdate(u.target + 3, u.confidence)),
-    ("order", reversed_answers),
-    ("forget", deaf),
-])
+@pytest.mark.parametrize(
+    ("clause", "change"),
+    [
+        ("shape", lambda r, u: EdgeUpdate(u.target[..., 0], u.confidence)),
+        ("range", lambda r, u: EdgeUpdate(u.target, u.confidence - 1)),
+        ("accuracy", lambda r, u: EdgeUpdate(u.target + 3, u.confidence)),
+        ("order", reversed_answers),
+        ("forget", deaf),
+    ],
+)
 def test_correspondence_faults_are_caught(clause, change):
     broken(clause, "correspondence", component(lambda: Wrapped(change)))
 
@@ -351,8 +377,9 @@ def test_reader_faults_are_caught():
         "shape": lambda fs: [replace(f, image=f.image[: 40 + f.index]) for f in fs],
         "index": lambda fs: [replace(f, index=0) for f in fs],
         "length": lambda fs: fs[:-1],
-        "repeatable": lambda fs: [replace(f, image=f.image ^ np.uint8(random.randrange(255)))
-                                  for f in fs],
+        "repeatable": lambda fs: [
+            replace(f, image=f.image ^ np.uint8(random.randrange(255))) for f in fs
+        ],
     }
     for clause, change in faults.items():
         broken(clause, "reader", reader(change), source="synthetic")
@@ -368,8 +395,9 @@ def test_reader_faults_are_caught():
             return super().open(source, selection)
 
     broken("recognises", "reader", component(Greedy), source="synthetic")
-    assert "FileNotFoundError" in broken("errors", "reader", component(Crashing),
-                                         source="synthetic")
+    assert "FileNotFoundError" in broken(
+        "errors", "reader", component(Crashing), source="synthetic"
+    )
     with pytest.raises(UsageError, match="footage"):
         conformance.check("reader", READER)
 
@@ -402,8 +430,12 @@ def test_exporter_faults_are_caught():
             return super().export(result, folder)
 
     conformance.check_exporter(component(Lines))
-    for clause, part in (("folder", Outside), ("files", Silent), ("errors", Fragile),
-                         ("no-mutation", Shifting)):
+    for clause, part in (
+        ("folder", Outside),
+        ("files", Silent),
+        ("errors", Fragile),
+        ("no-mutation", Shifting),
+    ):
         broken(clause, "exporter", component(part))
 
 

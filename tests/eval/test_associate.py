@@ -11,7 +11,9 @@ def greedy(est: np.ndarray, ref: np.ndarray, max_diff: float) -> list[tuple[int,
     """All pairs in order of their difference, each stamp once: the slow way."""
     pairs = sorted(
         (abs(a - b), i, j)
-        for i, a in enumerate(est) for j, b in enumerate(ref) if abs(a - b) <= max_diff
+        for i, a in enumerate(est)
+        for j, b in enumerate(ref)
+        if abs(a - b) <= max_diff
     )
     used_i, used_j, out = set(), set(), []
     for _, i, j in pairs:

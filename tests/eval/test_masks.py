@@ -38,8 +38,9 @@ def test_exact_with_and_without_ties(levels: int, seed: int) -> None:
     maps = [rng.integers(0, levels, (9, 12)).astype(np.uint16) for _ in range(3)]
     masks = [(m + rng.normal(0, levels / 3, m.shape)) > levels / 2 for m in maps]
     found = score_masks(maps, masks)
-    auc, f1, iou = brute_force(np.concatenate([m.ravel() for m in maps]),
-                               np.concatenate([m.ravel() for m in masks]))
+    auc, f1, iou = brute_force(
+        np.concatenate([m.ravel() for m in maps]), np.concatenate([m.ravel() for m in masks])
+    )
     assert found.auc == pytest.approx(auc, rel=1e-12)
     assert found.f1 == pytest.approx(f1, rel=1e-12)
     assert found.iou == pytest.approx(iou, rel=1e-12)

@@ -164,16 +164,17 @@ def write(path: Path, trajectory: Trajectory) -> Path:
 
 @pytest.mark.parametrize("align", ["sim3", "se3", "scale", "none"])
 @pytest.mark.parametrize("step", [1, 7])
-def test_same_figures_as_evo(
-    evo: SimpleNamespace, tmp_path: Path, align: str, step: int
-) -> None:
+def test_same_figures_as_evo(evo: SimpleNamespace, tmp_path: Path, align: str, step: int) -> None:
     truth = random_walk(120, 3)
     noisy = moved(truth, noise=0.01)
     # Every other frame, with stamps that are a little off.
     est = Trajectory(noisy.times[::2] + 0.003, noisy.T_wc[::2])
     est_file, ref_file = write(tmp_path / "est.tum", est), write(tmp_path / "ref.tum", truth)
     ours = score(
-        read_tum(est_file), read_tum(ref_file), align=align, delta=Delta(step)  # type: ignore[arg-type]
+        read_tum(est_file),
+        read_tum(ref_file),
+        align=align,
+        delta=Delta(step),  # type: ignore[arg-type]
     )
 
     ref, mine = evo.sync.associate_trajectories(

@@ -62,9 +62,7 @@ def test_cells_look_where_the_table_says() -> None:
             for turned in (picture, picture.flip(1, 2)):
                 turned = turned[None].clone().requires_grad_()
                 output = trunk(turned)[0][0, :, k, k]
-                signs = torch.randn(
-                    len(output), generator=torch.Generator().manual_seed(seed + 9)
-                )
+                signs = torch.randn(len(output), generator=torch.Generator().manual_seed(seed + 9))
                 (gradient,) = torch.autograd.grad((output * signs).sum(), turned)
                 energy = gradient[0].square().sum(0)
                 pixels = torch.arange(192.0)

@@ -33,8 +33,11 @@ def _picture(T_wc: np.ndarray, phase: float, rng: np.random.Generator) -> tuple[
     best = np.full((H, W), np.inf)
     colour = np.zeros((H, W, 3))
     for axis, value, base in (
-        (0, -3.0, (190, 150, 120)), (0, 3.0, (120, 150, 190)), (1, 1.4, (140, 120, 90)),
-        (1, -1.6, (225, 225, 220)), (2, 5.0, (170, 190, 160)),
+        (0, -3.0, (190, 150, 120)),
+        (0, 3.0, (120, 150, 190)),
+        (1, 1.4, (140, 120, 90)),
+        (1, -1.6, (225, 225, 220)),
+        (2, 5.0, (170, 190, 160)),
     ):
         with np.errstate(divide="ignore", invalid="ignore"):
             z = (value - T_wc[axis]) / rays[..., axis]
@@ -42,8 +45,9 @@ def _picture(T_wc: np.ndarray, phase: float, rng: np.random.Generator) -> tuple[
         checks = np.floor(hit * 1.5).sum(-1) % 2
         nearer = (z > 0) & (z < best)
         best = np.where(nearer, z, best)
-        colour = np.where(nearer[..., None], np.array(base) * (0.75 + 0.25 * checks[..., None]),
-                          colour)
+        colour = np.where(
+            nearer[..., None], np.array(base) * (0.75 + 0.25 * checks[..., None]), colour
+        )
     left = int(40 + 190 * phase)
     mask = np.zeros((H, W), dtype=bool)
     mask[90:210, left : left + 50] = True
@@ -84,10 +88,16 @@ def made_up_result(
         valid = ~moving & (rng.uniform(size=px.shape) > 0.08)
         records.append(
             KeyframeRecord(
-                index=int(i), time=float(times[i]), name=f"{i:06d}.jpg", image=image,
-                T_wc=T_wc[i], intrinsics=np.array([F, F, CX, CY]),
-                disp=(1 / grid).astype(np.float32), depth_valid=valid,
-                uncertainty=u.astype(np.float32), weight=weight.astype(np.float32),
+                index=int(i),
+                time=float(times[i]),
+                name=f"{i:06d}.jpg",
+                image=image,
+                T_wc=T_wc[i],
+                intrinsics=np.array([F, F, CX, CY]),
+                disp=(1 / grid).astype(np.float32),
+                depth_valid=valid,
+                uncertainty=u.astype(np.float32),
+                weight=weight.astype(np.float32),
             )
         )
         fine_y, fine_x = np.mgrid[0:H:3, 0:W:3]

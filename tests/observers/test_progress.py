@@ -49,7 +49,10 @@ class Bench:
     def __init__(self, stream: io.StringIO, **options: object) -> None:
         self.stream, self.clock = stream, Clock()
         self.line = ProgressLine(
-            stream=stream, clock=self.clock, memory=lambda: 411.6, **options  # type: ignore[arg-type]
+            stream=stream,
+            clock=self.clock,
+            memory=lambda: 411.6,
+            **options,  # type: ignore[arg-type]
         )
 
     def tell(self, event: Event, after: float = 0.05) -> None:
@@ -135,8 +138,10 @@ def test_dropped_keyframes_are_not_counted() -> None:
     bench.tell(KeyframeAdded(2, 1))
     bench.tell(KeyframeRemoved(2, 1))
     bench.tell(RunFailed("no motion"))
-    assert bench.stream.getvalue().splitlines()[-1].startswith(
-        "tracking stopped  1 frames  2 keyframes"
+    assert (
+        bench.stream.getvalue()
+        .splitlines()[-1]
+        .startswith("tracking stopped  1 frames  2 keyframes")
     )
 
 

@@ -90,8 +90,13 @@ def test_the_whole_page(full: RunResult, tmp_path: Path) -> None:
     assert isinstance(observer, Observer)
     observer.on_event(RunWarning("the focal length is a guess"))
     metrics = {
-        "ate_rmse": 0.0123, "unit": "m", "align": "sim3", "ate_percent": 0.8,
-        "rpe_trans_rmse": None, "notes": [], "masks": {"auc": 0.943},
+        "ate_rmse": 0.0123,
+        "unit": "m",
+        "align": "sim3",
+        "ate_percent": 0.8,
+        "rpe_trans_rmse": None,
+        "notes": [],
+        "masks": {"auc": 0.943},
     }
     observer.on_event(RunFinished(full, tmp_path, metrics))
     page = checked((tmp_path / "report.html").read_text(encoding="utf-8"))
@@ -114,9 +119,7 @@ def test_other_events_write_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("frames", "keyframes"), [(0, 0), (1, 0), (1, 1), (2, 1), (3, 2)]
-)
+@pytest.mark.parametrize(("frames", "keyframes"), [(0, 0), (1, 0), (1, 1), (2, 1), (3, 2)])
 @pytest.mark.parametrize("with_truth", [True, False])
 def test_short_runs(
     make_result: Make, tmp_path: Path, frames: int, keyframes: int, with_truth: bool

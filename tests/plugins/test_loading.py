@@ -58,9 +58,7 @@ def test_broken_import_is_listed_and_harms_nobody(acme):
     plugins = droidw.load_plugins(environ={})
     found = failure(plugins, "acme-depth")
     assert found.origin == "droidw-acme 1.2"
-    assert found.error == (
-        "ModuleNotFoundError: No module named 'acme_net_that_is_not_there'"
-    )
+    assert found.error == ("ModuleNotFoundError: No module named 'acme_net_that_is_not_there'")
     assert "acme_import_error.py" in found.traceback
     assert "cnn" in plugins.registry("features")
     with pytest.raises(PluginError) as caught:
@@ -296,7 +294,5 @@ def test_listing_plugins_loads_nothing_heavy():
         "import sys, droidw; p = droidw.load_plugins();"
         "print([m for m in ('torch', 'cv2', 'av', 'kornia') if m in sys.modules])"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -75,7 +75,12 @@ def test_one_row_of_cells_can_be_sampled() -> None:
     gates = torch.full((2, 1, 1), 0.5)
     confidence = torch.ones(1, 1, 1, 2)
     weight = residual_weights(
-        confidence, None, gates, torch.tensor([0]), torch.tensor([1]),
-        torch.zeros(1, 1, 1, 2), bidirectional=True,
+        confidence,
+        None,
+        gates,
+        torch.tensor([0]),
+        torch.tensor([1]),
+        torch.zeros(1, 1, 1, 2),
+        bidirectional=True,
     )
     assert weight.flatten().tolist() == [0.25, 0.25]

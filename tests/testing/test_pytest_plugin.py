@@ -17,7 +17,9 @@ def test_fixtures(device, scene, droidw_build):
 
 
 def test_the_plugin_costs_other_projects_nothing():
-    code = ("import sys, droidw.testing.pytest_plugin\n"
-            "print([m for m in ('torch', 'cv2', 'kornia') if m in sys.modules])")
+    code = (
+        "import sys, droidw.testing.pytest_plugin\n"
+        "print([m for m in ('torch', 'cv2', 'kornia') if m in sys.modules])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -52,8 +52,12 @@ def test_static_correspondence_is_the_projection_of_the_true_depth():
     found = scene.correspond(0, 4, pixels(SMALL))
     T_cw = se3.inv(torch.from_numpy(np.stack([scene.T_wc(0), scene.T_wc(4)])))
     coords, valid = projective.reproject(
-        T_cw, torch.from_numpy(1 / depth)[None].expand(2, -1, -1),
-        torch.from_numpy(scene.intrinsics), torch.tensor([0]), torch.tensor([1]))
+        T_cw,
+        torch.from_numpy(1 / depth)[None].expand(2, -1, -1),
+        torch.from_numpy(scene.intrinsics),
+        torch.tensor([0]),
+        torch.tensor([1]),
+    )
     use = found.visible & ~found.moving & valid[0].numpy()
     assert use.mean() > 0.5
     assert np.abs(coords[0].numpy() - found.target)[use].max() < 1e-9
@@ -103,8 +107,12 @@ def test_pictures_agree_with_the_truth_so_that_flow_can_work():
     scene = Scene(SceneSpec(width=160, height=120, frames=4, fps=15, noise=0.5))
     first, second = scene.render(0), scene.render(3)
     target, visible = scene.flow(0, 3)
-    warped = cv2.remap(second.image, target[..., 0].astype(np.float32),
-                       target[..., 1].astype(np.float32), cv2.INTER_LINEAR)
+    warped = cv2.remap(
+        second.image,
+        target[..., 0].astype(np.float32),
+        target[..., 1].astype(np.float32),
+        cv2.INTER_LINEAR,
+    )
     same = np.abs(warped.astype(int) - first.image).mean(-1)[visible]
     still = np.abs(second.image.astype(int) - first.image).mean(-1)[visible]
     assert np.median(same) < 2.5

@@ -37,10 +37,16 @@ def encoded(op, long_side=160):
 
 def ask(session, payloads, grid, edges, ids=None):
     shape = len(edges), grid.height, grid.width
-    return session.update(EdgeRequest(
-        ids if ids is not None else list(range(len(edges))), [i for i, _ in edges],
-        [j for _, j in edges], torch.zeros(*shape, 2), torch.ones(shape, dtype=torch.bool),
-        payloads.__getitem__))
+    return session.update(
+        EdgeRequest(
+            ids if ids is not None else list(range(len(edges))),
+            [i for i, _ in edges],
+            [j for _, j in edges],
+            torch.zeros(*shape, 2),
+            torch.ones(shape, dtype=torch.bool),
+            payloads.__getitem__,
+        )
+    )
 
 
 def test_reader_gives_frames_camera_and_truth():
@@ -82,8 +88,12 @@ def test_targets_are_the_reprojection_of_the_truth_at_any_working_size(long_side
     depth = np.stack([op.scene.depth_at(p.index, p.cells) for p in payloads])
     moving = op.scene.correspond(0, 3, payloads[0].cells).moving
     coords, valid = projective.reproject(
-        se3.inv(torch.from_numpy(source.truth.T_wc)), torch.from_numpy(1 / depth),
-        grid.intrinsics(frames[0].intrinsics.double()), torch.tensor([0]), torch.tensor([3]))
+        se3.inv(torch.from_numpy(source.truth.T_wc)),
+        torch.from_numpy(1 / depth),
+        grid.intrinsics(frames[0].intrinsics.double()),
+        torch.tensor([0]),
+        torch.tensor([3]),
+    )
     static = (update.confidence[0, ..., 0] > 0) & valid[0] & ~torch.from_numpy(moving)
     assert static.float().mean() > 0.4
     assert (update.target[0] - coords[0])[static].abs().max() < 1e-4

@@ -27,9 +27,7 @@ def _view(model: UncertaintyModel, channels: int = C, seed: int = 0) -> Uncertai
     columns, where they change in all channels but the first, which tells them apart."""
     generator = torch.Generator().manual_seed(seed)
     features = torch.randn(1, channels, H, W, generator=generator).repeat(N, 1, 1, 1)
-    features[:, 1:, :, 4:] = torch.randn(
-        N, max(channels - 1, 0), H, 3, generator=generator
-    )
+    features[:, 1:, :, 4:] = torch.randn(N, max(channels - 1, 0), H, 3, generator=generator)
     if channels:
         features[:, 0] = -2.0
         features[:, 0, :, 4:] = 2.0
@@ -40,16 +38,21 @@ def _view(model: UncertaintyModel, channels: int = C, seed: int = 0) -> Uncertai
     ii, jj = ii.flatten()[keep], jj.flatten()[keep]
     sizes = {"h": H, "w": W, "c": channels}
     fields = {
-        f.name: torch.full(
-            (N, *(sizes[s] if isinstance(s, str) else s for s in f.shape)), f.fill
-        )
+        f.name: torch.full((N, *(sizes[s] if isinstance(s, str) else s for s in f.shape)), f.fill)
         for f in model.fields
     }
     return UncertaintyView(
-        features=features, uncertainty=torch.zeros(N, H, W), fields=fields, T_cw=T_cw,
-        disps=torch.ones(N, H, W), intrinsics=torch.tensor([8.0, 8.0, 3.0, 2.5]),
-        ii=ii, jj=jj, target=torch.zeros(len(ii), H, W, 2),
-        confidence=torch.ones(len(ii), H, W, 2), frames=torch.arange(N),
+        features=features,
+        uncertainty=torch.zeros(N, H, W),
+        fields=fields,
+        T_cw=T_cw,
+        disps=torch.ones(N, H, W),
+        intrinsics=torch.tensor([8.0, 8.0, 3.0, 2.5]),
+        ii=ii,
+        jj=jj,
+        target=torch.zeros(len(ii), H, W, 2),
+        confidence=torch.ones(len(ii), H, W, 2),
+        frames=torch.arange(N),
     )
 
 

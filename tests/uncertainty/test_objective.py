@@ -132,9 +132,11 @@ def test_softplus_has_the_published_values_and_slope() -> None:
 )
 def test_fixed_points_are_the_published_ones(cosine: float, u: float) -> None:
     # REFERENCE 4.3: with the same u on both sides of every edge, rho = 0.5 u^3 / (u + 1).
-    coords = torch.stack(
-        torch.meshgrid(torch.arange(5.0), torch.arange(4.0), indexing="xy"), dim=-1
-    ).to(F64)[None].expand(2, -1, -1, -1)
+    coords = (
+        torch.stack(torch.meshgrid(torch.arange(5.0), torch.arange(4.0), indexing="xy"), dim=-1)
+        .to(F64)[None]
+        .expand(2, -1, -1, -1)
+    )
     valid = torch.ones(2, 4, 5, dtype=torch.bool)
     samples = objective.make_samples(coords, valid, torch.tensor([0, 1]), torch.tensor([1, 0]))
     rho = objective.residual(torch.full((2, 20), cosine, dtype=F64), samples, 0.5)
@@ -143,9 +145,7 @@ def test_fixed_points_are_the_published_ones(cosine: float, u: float) -> None:
         pair, _ = objective.pair_gradient(table, rho, samples)
         # gamma_data 0.1 times two derivatives of the pair energy over n_k = 2 edges
         counts = torch.tensor([2, 2])
-        step = objective.frame_gradient(
-            pair.view(2, 4, 5), table.view(2, 4, 5), counts, 0.1, 0.05
-        )
+        step = objective.frame_gradient(pair.view(2, 4, 5), table.view(2, 4, 5), counts, 0.1, 0.05)
         table = table - 0.5 * step.view(2, 20)
     assert abs(float(table.mean()) - u) < 0.006
     assert float(table.std()) < 1e-9

@@ -107,7 +107,7 @@ class FlowCorrespondence:
 
     def session(self, purpose: Purpose = "window") -> _FlowSession:
         """Fresh edge state; flows already measured are shared between sessions."""
-        return _FlowSession(self, one_way=purpose == "fill", guided=purpose == "global")
+        return _FlowSession(self, one_way=purpose == "fill")
 
     # -- measuring -------------------------------------------------------------------------
 
@@ -124,13 +124,17 @@ class FlowCorrespondence:
 
     def _search(self, a: FlowFrame, b: FlowFrame, start: Array | None = None) -> Array:
         """Dense flow a -> b, [H,W,2] pixels."""
-        engine = getattr(self._local, "engine", None)
+        # An engine remembers that it was once given a start, and answers differently ever after:
+        # one for each use, or the result would depend on which thread did what before.
+        name = "free" if start is None else "started"
+        engine = getattr(self._local, name, None)
         if engine is None:
             engine = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
             engine.setFinestScale(self.options.finest_scale)
             engine.setGradientDescentIterations(self.options.iterations)
             engine.setVariationalRefinementIterations(self.options.refinement)
-            self._local.engine = engine
+            engine.setPatchStride(self.options.patch_stride)
+            setattr(self._local, name, engine)
         flow: Array = engine.calc(a.grey, b.grey, None if start is None else start.copy())
         return flow
 
@@ -227,7 +231,10 @@ class FlowCorrespondence:
         cols = np.float32(np.clip((np.arange(width) - self.offset) / self.stride, 0, None))
         map_x, map_y = np.meshgrid(cols, rows)
         dense: Array = cv2.remap(
-            np.ascontiguousarray(flow, dtype=np.float32), map_x, map_y, cv2.INTER_LINEAR,
+            np.ascontiguousarray(flow, dtype=np.float32),
+            map_x,
+            map_y,
+            cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         )
         return np.clip(dense, -2.0 * width, 2.0 * width)
@@ -260,10 +267,9 @@ class FlowCorrespondence:
 class _FlowSession:
     """Edges measured once, and again when geometry says that the search went elsewhere."""
 
-    def __init__(self, owner: FlowCorrespondence, *, one_way: bool, guided: bool) -> None:
+    def __init__(self, owner: FlowCorrespondence, *, one_way: bool) -> None:
         self._owner = owner
         self._one_way = one_way
-        self._guided = guided
         self._edges: dict[int, _Edge] = {}
 
     def forget(self, ids: list[int]) -> None:
@@ -323,10 +329,7 @@ class _FlowSession:
             pairs.setdefault((min(i, j), max(i, j)), {})[i < j] = row
 
         def start(row: int | None) -> Array | None:
-            # In the window the first search is free: the newest pose is what it has to find.
             if row is None or not request.informed:
-                return None
-            if not self._guided and request.ids[row] not in self._edges:
                 return None
             valid = request.valid[row].cpu().numpy()
             return coords[row] if valid.mean() > 0.5 else None

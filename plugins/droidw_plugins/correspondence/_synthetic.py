@@ -56,9 +56,16 @@ class SyntheticCorrespondence:
         self.stride = options.stride
         self.offset = (options.stride - 1) / 2
         self.options = options
-        self.scene = Scene(named_spec(
-            options.scene, width=options.width, height=options.height, frames=options.frames,
-            fps=options.fps, seed=options.seed))
+        self.scene = Scene(
+            named_spec(
+                options.scene,
+                width=options.width,
+                height=options.height,
+                frames=options.frames,
+                fps=options.fps,
+                seed=options.seed,
+            )
+        )
         self._seed = seed
 
     def encode(self, frame: Frame, grid: Grid) -> SyntheticPayload:
@@ -93,8 +100,11 @@ class SyntheticCorrespondence:
         """Fresh edge state: it remembers the answer of each edge until it is forgotten."""
         return SyntheticSession(self)
 
-    def exact(self, source: SyntheticPayload, target: SyntheticPayload,
-              ) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    def exact(
+        self,
+        source: SyntheticPayload,
+        target: SyntheticPayload,
+    ) -> tuple[Floats, npt.NDArray[np.bool_]]:
         """True position of each cell of `source` in `target` [h,w,2], cells; and visibility."""
         found = self.scene.correspond(source.index, target.index, source.cells)
         K_scene, K = self.scene.intrinsics, target.intrinsics
@@ -114,8 +124,10 @@ class SyntheticCorrespondence:
             error = rng.uniform(-o.outlier_px, o.outlier_px, position.shape) / self.stride
             position = np.where(wrong[..., None], position + error, position)
         confidence = np.repeat(visible[..., None] * o.confidence, 2, axis=-1)
-        return (torch.from_numpy(position.astype(np.float32)),
-                torch.from_numpy(confidence.astype(np.float32)))
+        return (
+            torch.from_numpy(position.astype(np.float32)),
+            torch.from_numpy(confidence.astype(np.float32)),
+        )
 
 
 class SyntheticSession:
@@ -135,8 +147,10 @@ class SyntheticSession:
             empty = request.coords.to(torch.float32)
             return EdgeUpdate(empty.clone(), empty.clone())
         answers = [self._known[name] for name in request.ids]
-        return EdgeUpdate(torch.stack([target for target, _ in answers]).to(device),
-                          torch.stack([confidence for _, confidence in answers]).to(device))
+        return EdgeUpdate(
+            torch.stack([target for target, _ in answers]).to(device),
+            torch.stack([confidence for _, confidence in answers]).to(device),
+        )
 
     def forget(self, ids: list[int]) -> None:
         """Drop these edges; unknown ids are ignored."""

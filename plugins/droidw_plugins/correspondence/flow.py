@@ -17,14 +17,17 @@ class FlowOptions:
 
     stride: int = field(default=8, metadata={"help": "grid cell in pixels", "ge": 2, "le": 16})
     finest_scale: int = field(
-        default=1,
+        default=0,
         metadata={"help": "finest pyramid level of the search (0: full size)", "ge": 0, "le": 3},
     )
     iterations: int = field(
-        default=12, metadata={"help": "gradient descent iterations per patch", "ge": 1, "le": 100}
+        default=4, metadata={"help": "gradient descent iterations per patch", "ge": 1, "le": 100}
+    )
+    patch_stride: int = field(
+        default=6, metadata={"help": "pixels between the patches of the search", "ge": 1, "le": 8}
     )
     refinement: int = field(
-        default=5, metadata={"help": "variational refinement iterations", "ge": 0, "le": 20}
+        default=0, metadata={"help": "variational refinement iterations", "ge": 0, "le": 20}
     )
     consistency: float = field(
         default=0.5,
@@ -34,13 +37,15 @@ class FlowOptions:
         default=3.0, metadata={"help": "forward-backward error without any confidence", "gt": 0.0}
     )
     texture: float = field(
-        default=4.0,
+        default=2.0,
         metadata={"help": "image gradient (grey levels) at which confidence halves", "ge": 0.0},
     )
     restart: float = field(
         default=2.0,
-        metadata={"help": "cells between prediction and measurement that repeat a search",
-                  "gt": 0.0},
+        metadata={
+            "help": "cells between prediction and measurement that repeat a search",
+            "gt": 0.0,
+        },
     )
     restarts: int = field(default=1, metadata={"help": "repeated searches per edge", "ge": 0})
     still: float = field(

@@ -30,8 +30,11 @@ class SyntheticCorrespondenceOptions:
     )
     outlier_share: float = field(
         default=0.0,
-        metadata={"help": "share of cells with a wrong target and full confidence",
-                  "ge": 0, "le": 1},
+        metadata={
+            "help": "share of cells with a wrong target and full confidence",
+            "ge": 0,
+            "le": 1,
+        },
     )
     outlier_px: float = field(
         default=40.0, metadata={"help": "largest error of a wrong target, working pixels", "ge": 0}

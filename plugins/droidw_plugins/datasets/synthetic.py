@@ -91,14 +91,20 @@ class SyntheticReader:
             )
         o = self._options
         try:
-            spec = named_spec(name, width=o.width, height=o.height, frames=o.frames, fps=o.fps,
-                              seed=o.seed, noise=o.noise)
+            spec = named_spec(
+                name,
+                width=o.width,
+                height=o.height,
+                frames=o.frames,
+                fps=o.fps,
+                seed=o.seed,
+                noise=o.noise,
+            )
         except UsageError as error:
             raise InputError(f"{source}: {error.message}", error.hint) from error
         if selection.skip >= o.frames:
             raise InputError(
-                f"{source}: nothing is left of {o.frames} pictures after skipping "
-                f"{selection.skip}",
+                f"{source}: nothing is left of {o.frames} pictures after skipping {selection.skip}",
                 "give a smaller input.skip, or more pictures: reader.options.frames",
             )
         return SyntheticSource(name, Scene(spec), selection)

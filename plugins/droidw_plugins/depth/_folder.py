@@ -100,7 +100,10 @@ class FileDepth:
             if self.missing == 1:
                 _log.warning(
                     "no depth map for frame %d (%s, t = %.3f s); %d maps are available in %s",
-                    frame.index, frame.name or "no name", frame.time, self.available,
+                    frame.index,
+                    frame.name or "no name",
+                    frame.time,
+                    self.available,
                     self._files[0].parent,
                 )
             return None

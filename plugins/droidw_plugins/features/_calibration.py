@@ -57,8 +57,12 @@ def is_blank(image: Tensor) -> bool:
 
 
 def from_weights(
-    statistics: Sequence[ChannelStatistics], shares: Sequence[float], whiten: bool,
-    constant: float, length: float, dim: int | None = None,
+    statistics: Sequence[ChannelStatistics],
+    shares: Sequence[float],
+    whiten: bool,
+    constant: float,
+    length: float,
+    dim: int | None = None,
 ) -> Calibration:
     """Mean and per-channel deviation as batch normalisation holds them (no picture needed).
 
@@ -80,8 +84,13 @@ def from_weights(
 
 
 def from_picture(
-    taps: Sequence[Tensor], statistics: Sequence[ChannelStatistics], shares: Sequence[float],
-    shrinkage: float, dim: int | None, constant: float, length: float,
+    taps: Sequence[Tensor],
+    statistics: Sequence[ChannelStatistics],
+    shares: Sequence[float],
+    shrinkage: float,
+    dim: int | None,
+    constant: float,
+    length: float,
 ) -> Calibration:
     """Whitening by the covariance of one picture, shrunk towards that of the weights.
 

@@ -63,7 +63,8 @@ class CnnFeatures:
                 f"features.options.tap_weights: {list(self._shares)} must be {len(taps)} positive "
                 f"numbers, one for each of features.options.taps = {list(taps)}",
                 "for equal shares: features.options.tap_weights=["
-                + ",".join("1" for _ in taps) + "]",
+                + ",".join("1" for _ in taps)
+                + "]",
             )
         path = Path(options.weights).expanduser() if options.weights else find_weights()
         self._trunk, self.weights_sha256 = load_trunk(path, taps, context.device)
@@ -78,8 +79,12 @@ class CnnFeatures:
         self.dim = rows + extra
         self._fixed: Calibration | None = None
         self._default = from_weights(
-            self._trunk.statistics, self._shares, options.calibration != "none",
-            options.constant, options.length, self._rows,
+            self._trunk.statistics,
+            self._shares,
+            options.calibration != "none",
+            options.constant,
+            options.length,
+            self._rows,
         )
         if options.calibration != "picture":
             self._fixed = self._default
@@ -98,8 +103,13 @@ class CnnFeatures:
             if not is_blank(image):
                 options = self._options
                 calibration = self._fixed = from_picture(
-                    taps, statistics, self._shares, options.shrinkage, self._rows,
-                    options.constant, options.length,
+                    taps,
+                    statistics,
+                    self._shares,
+                    options.shrinkage,
+                    self._rows,
+                    options.constant,
+                    options.length,
                 )
         return calibration(torch.cat(taps)).to(getattr(torch, self._options.dtype))
 
@@ -114,8 +124,10 @@ class CnnFeatures:
         if state:
             device = self._mean.device
             self._fixed = Calibration(
-                state["matrix"].to(device), state["mean"].to(device),
-                self._options.constant, self._options.length,
+                state["matrix"].to(device),
+                state["mean"].to(device),
+                self._options.constant,
+                self._options.length,
             )
 
     def _taps(self, image: Tensor, grid: Grid) -> list[Tensor]:

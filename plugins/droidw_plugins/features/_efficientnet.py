@@ -133,8 +133,14 @@ class Trunk:
                 )
             convs.append(
                 self._fold(
-                    state, f"{name}._depthwise_conv", f"{name}._bn1",
-                    wide, 1, spec.kernel, spec.stride, wide,
+                    state,
+                    f"{name}._depthwise_conv",
+                    f"{name}._bn1",
+                    wide,
+                    1,
+                    spec.kernel,
+                    spec.stride,
+                    wide,
                 )
             )
             convs.append(
@@ -171,8 +177,15 @@ class Trunk:
         return found
 
     def _fold(
-        self, state: Mapping[str, Tensor], conv: str, norm: str,
-        outputs: int, inputs: int, kernel: int, stride: int, groups: int,
+        self,
+        state: Mapping[str, Tensor],
+        conv: str,
+        norm: str,
+        outputs: int,
+        inputs: int,
+        kernel: int,
+        stride: int,
+        groups: int,
     ) -> _Conv:
         weight = _take(state, f"{conv}.weight", (outputs, inputs, kernel, kernel))
         scale = _take(state, f"{norm}.weight", (outputs,))
@@ -183,7 +196,9 @@ class Trunk:
         folded = (weight * factor[:, None, None, None]).to(self._device, self._dtype)
         return _Conv(
             folded.contiguous(memory_format=torch.channels_last),
-            (shift - mean * factor).to(self._device, self._dtype), stride, groups,
+            (shift - mean * factor).to(self._device, self._dtype),
+            stride,
+            groups,
         )
 
 

@@ -58,9 +58,7 @@ class CnnOptions:
             "ge": 0,
         },
     )
-    length: float = field(
-        default=20.0, metadata={"help": "length of a feature vector", "gt": 0}
-    )
+    length: float = field(default=20.0, metadata={"help": "length of a feature vector", "gt": 0})
     weights: str | None = field(
         default=None, metadata={"help": "path of the weights file (none: that of the package)"}
     )

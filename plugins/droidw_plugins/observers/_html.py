@@ -115,9 +115,11 @@ def tile(value: str, unit: str, label: str, more: str = "") -> str:
 
 def definitions(rows: Iterable[tuple[str, object]]) -> str:
     """Names and values."""
-    return "<dl>" + "".join(
-        f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in rows
-    ) + "</dl>"
+    return (
+        "<dl>"
+        + "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in rows)
+        + "</dl>"
+    )
 
 
 def bars(rows: Iterable[tuple[str, float]], unit: str, whole: float) -> str:

@@ -59,8 +59,9 @@ def keyframe_pictures(
     chosen = choose(len(keyframes), most)
     records = [keyframes[number] for number in chosen]
     u_low, u_high = _range([k.uncertainty for k in records])
-    d_low, d_high = _range([k.disp[k.depth_valid] if k.depth_valid.any() else k.disp
-                            for k in records])
+    d_low, d_high = _range(
+        [k.disp[k.depth_valid] if k.depth_valid.any() else k.disp for k in records]
+    )
     pictures = []
     for number, record in zip(chosen, records, strict=True):
         image = cv2.cvtColor(np.ascontiguousarray(record.image), cv2.COLOR_RGB2BGR)
@@ -144,7 +145,10 @@ def _spread(
     y = ((np.arange(size[1]) + 0.5) * full[1] / size[1] - 0.5 - offset) / stride
     map_x, map_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
     sampled = cv2.remap(
-        np.ascontiguousarray(grid, dtype=np.float32), map_x, map_y, cv2.INTER_LINEAR,
+        np.ascontiguousarray(grid, dtype=np.float32),
+        map_x,
+        map_y,
+        cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
     return np.asarray(sampled, dtype=np.float32)

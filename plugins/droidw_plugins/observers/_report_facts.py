@@ -104,11 +104,14 @@ def all_metrics(metrics: Mapping[str, Any]) -> str:
 def files(manifest: Mapping[str, Any], run_dir: Path) -> str:
     """The files of the run folder, with sizes and what each is."""
     named = manifest.get("files")
-    meaning = {str(key): str(value) for key, value in named.items()} if isinstance(
-        named, Mapping) else {}
-    there = {
-        path.name for path in run_dir.iterdir() if not path.name.startswith(".")
-    } if run_dir.is_dir() else set()
+    meaning = (
+        {str(key): str(value) for key, value in named.items()} if isinstance(named, Mapping) else {}
+    )
+    there = (
+        {path.name for path in run_dir.iterdir() if not path.name.startswith(".")}
+        if run_dir.is_dir()
+        else set()
+    )
     there.add("report.html")
     # An entry of the manifest may name a file inside a folder, such as depth/000000.png.
     names = sorted(there | {name for name in meaning if (run_dir / name).exists()})
@@ -163,8 +166,11 @@ def parts_used(manifest: Mapping[str, Any]) -> str:
     if not rows:
         return ""
     body = "".join(f"<tr>{row}</tr>" for row in rows)
-    return section("Parts", f'<div class="scroll"><table>{body}</table></div>',
-                   manifest_text(manifest.get("note")))
+    return section(
+        "Parts",
+        f'<div class="scroll"><table>{body}</table></div>',
+        manifest_text(manifest.get("note")),
+    )
 
 
 def versions_used(manifest: Mapping[str, Any]) -> str:

@@ -29,6 +29,7 @@ from droidw_plugins.observers._truth import Paths, make_paths
 
 __all__ = ["Report", "build_page"]
 
+
 class Report:
     """Writes `report.html` into the run folder when a run has finished.
 
@@ -131,8 +132,14 @@ def _tiles(result: RunResult, paths: Paths, metrics: Mapping[str, Any]) -> str:
     if paths.unit or paths.depth is None:
         tiles.append(tile(f"{paths.length:.3g}", paths.unit or "units", "path length"))
     else:
-        tiles.append(tile(f"{paths.length / paths.depth:.3g}", "x depth", "path length",
-                          "in median scene depths"))
+        tiles.append(
+            tile(
+                f"{paths.length / paths.depth:.3g}",
+                "x depth",
+                "path length",
+                "in median scene depths",
+            )
+        )
     ate = number(metrics.get("ate_rmse"))
     unit = str(metrics.get("unit", paths.unit or "m"))
     if ate is None and len(paths.errors):
@@ -168,10 +175,16 @@ def _trajectory(paths: Paths) -> str:
             lines.append(Line(paths.truth[:, axes] * flip, "truth"))
         lines.append(Line(paths.centres[:, axes] * flip, "est"))
         drawn = path_view(
-            f"trajectory {title}", names, lines, paths.keyframes[:, axes] * flip,
-            (length, label), least_span=least,
+            f"trajectory {title}",
+            names,
+            lines,
+            paths.keyframes[:, axes] * flip,
+            (length, label),
+            least_span=least,
         )
-        views.append(f"<figure>{drawn}<figcaption>{escape(title.capitalize())}</figcaption></figure>")
+        views.append(
+            f"<figure>{drawn}<figcaption>{escape(title.capitalize())}</figcaption></figure>"
+        )
     legend = [
         _sample('<path class="est" d="M1 6H25"/>', "estimate"),
         _sample('<circle class="key" cx="13" cy="6" r="3"/>', "keyframe"),
@@ -183,11 +196,11 @@ def _trajectory(paths: Paths) -> str:
     body = f'<div class="legend">{"".join(legend)}</div><div class="pair">{"".join(views)}</div>'
     if len(paths.errors) > 1:
         rmse = float(np.sqrt(np.mean(paths.errors**2)))
-        chart = error_chart(
-            paths.error_times, paths.errors, rmse, paths.keyframe_times, paths.unit
-        )
-        body += f'<figure class="chart"><div>{chart}</div><figcaption>Position error over time, ' \
+        chart = error_chart(paths.error_times, paths.errors, rmse, paths.keyframe_times, paths.unit)
+        body += (
+            f'<figure class="chart"><div>{chart}</div><figcaption>Position error over time, '
             "in seconds from the first frame; ticks mark keyframes</figcaption></figure>"
+        )
     hint = "Seen in the frame of the first camera, both axes to one scale."
     if paths.truth is not None:
         hint += " The truth is laid on the estimate by the best similarity (Sim(3))."

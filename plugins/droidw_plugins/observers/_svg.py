@@ -98,8 +98,7 @@ def path_view(
     parts += [
         f'<path class="bar" d="M{margin} {y - 4}v8M{margin} {y}h{length:.2f}m0 -4v8"/>',
         f'<text class="note" x="{margin + length + 10:.1f}" y="{y + 4}">{escape(bar[1])}</text>',
-        f'<text class="note end-text" x="{width - 10}" y="{y + 4}">'
-        f"{escape(axes[0])} →</text>",
+        f'<text class="note end-text" x="{width - 10}" y="{y + 4}">{escape(axes[0])} →</text>',
         f'<text class="note" x="10" y="18">↑ {escape(axes[1])}</text>',
         "</svg>",
     ]
@@ -182,9 +181,7 @@ def error_chart(
         )
     ticks = [x_of(t) for t in keyframe_times.tolist() if t0 <= t <= t1]
     base = height - bottom
-    parts.append(
-        f'<path class="tick" d="{"".join(f"M{x:.1f} {base}v5" for x in ticks)}"/>'
-    )
+    parts.append(f'<path class="tick" d="{"".join(f"M{x:.1f} {base}v5" for x in ticks)}"/>')
     curve = _peaks(np.stack([times, errors], axis=1))
     shown = np.array([[x_of(t), y_of(e)] for t, e in curve])
     area = " ".join(f"{x:.1f},{y:.1f}" for x, y in shown)

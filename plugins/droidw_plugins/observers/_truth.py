@@ -143,8 +143,10 @@ def _finite(trajectory: Trajectory) -> tuple[Array, Array]:
 
 
 def _median_depth(result: RunResult) -> float | None:
-    values = [k.disp[np.isfinite(k.disp) & (k.disp > 0)] for k in result.keyframes[:: max(
-        1, len(result.keyframes) // 20)]]
+    values = [
+        k.disp[np.isfinite(k.disp) & (k.disp > 0)]
+        for k in result.keyframes[:: max(1, len(result.keyframes) // 20)]
+    ]
     values = [v for v in values if v.size]
     if not values:
         return None

@@ -202,7 +202,5 @@ class AffineSoftplus:
         samples = objective.make_samples(coords, valid, ii - first, jj - first)
         cosine = objective.similarity(self._rows(view, first, last), samples)
         rho = objective.residual(cosine, samples, self._options.similarity_threshold)
-        self._pairs = _Pairs(
-            view.ii.clone(), view.jj.clone(), first, last, counts, samples, rho
-        )
+        self._pairs = _Pairs(view.ii.clone(), view.jj.clone(), first, last, counts, samples, rho)
         return self._pairs

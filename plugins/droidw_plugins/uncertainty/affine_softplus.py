@@ -32,9 +32,7 @@ class AffineSoftplusOptions:
         default=0.1,
         metadata={"help": "u = log(1 + offset + e^y); 0 is the paper's form", "ge": 0},
     )
-    bias: bool = field(
-        default=True, metadata={"help": "learn a bias (the paper's form has none)"}
-    )
+    bias: bool = field(default=True, metadata={"help": "learn a bias (the paper's form has none)"})
     init_scale: float = field(
         default=1.0,
         metadata={
@@ -58,12 +56,8 @@ class AffineSoftplusOptions:
         default=True,
         metadata={"help": "map features to u; false: a free u per cell, in [u_min, u_max]"},
     )
-    u_min: float = field(
-        default=0.1, metadata={"help": "smallest u where not affine", "gt": 0}
-    )
-    u_max: float = field(
-        default=2.0, metadata={"help": "largest u where not affine", "gt": 0}
-    )
+    u_min: float = field(default=0.1, metadata={"help": "smallest u where not affine", "gt": 0})
+    u_max: float = field(default=2.0, metadata={"help": "largest u where not affine", "gt": 0})
     refresh: int = field(
         default=1,
         metadata={"help": "similarities are renewed at every n-th step on the same edges", "ge": 1},
