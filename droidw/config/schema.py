@@ -69,7 +69,7 @@ class CameraConfig:
 class MotionFilterConfig:
     """Which frames become candidates for keyframes."""
 
-    threshold: float = opt(0.9, "mean flow from the last keyframe, in grid cells", gt=0)
+    threshold: float = opt(1.2, "mean flow from the last keyframe, in grid cells", gt=0)
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
         0.3,
@@ -89,7 +89,7 @@ class SolverConfig:
 
     lm: float = opt(1e-4, "relative damping of the reduced system", ge=0)
     ep: float = opt(0.1, "absolute damping of the reduced system", ge=0)
-    huber: float = opt(0.0, "Huber threshold in grid cells (0: quadratic)", ge=0)
+    huber: float = opt(0.2, "Huber threshold in grid cells (0: quadratic)", ge=0)
     guard: bool = opt(False, "shorten or reject a step that raises the energy")
 
 
@@ -111,15 +111,14 @@ class FrontendConfig:
     warmup: int = opt(8, "keyframes before initialisation", ge=2)
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     init_beta: float = opt(0.25, "the same during initialisation", ge=0, le=1)
-    keyframe_threshold: float = opt(
-        0.5, "distance below which the newest keyframe is dropped", ge=0
+    keyframe_threshold: float = opt(0.8, "distance below which the newest keyframe is dropped", ge=0
     )
-    threshold: float = opt(16.0, "largest frame distance of a proximity edge, in cells", gt=0)
+    threshold: float = opt(8.0, "largest frame distance of a proximity edge, in cells", gt=0)
     window: int = opt(25, "keyframes searched for proximity edges", ge=2)
     radius: int = opt(2, "neighbours always linked", ge=1)
-    nms: int = opt(1, "suppression radius around existing edges", ge=0)
+    nms: int = opt(2, "suppression radius around existing edges", ge=0)
     max_factors: int = opt(75, "active edges at most", ge=4)
-    max_age: int = opt(50, "updates after which an edge is retired", ge=1)
+    max_age: int = opt(12, "updates after which an edge is retired", ge=1)
     predict: Literal["velocity", "hold"] = opt(
         "velocity", "velocity: go on with the last motion and depth; hold: last pose, mean depth"
     )
@@ -129,19 +128,19 @@ class FrontendConfig:
 class BackendConfig:
     """Global bundle adjustment after tracking."""
 
-    passes: list[int] = opt([7, 12], "update steps of each global pass")
+    passes: list[int] = opt([2, 2, 2], "update steps of each global pass")
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)
-    nms: int = opt(5, "suppression radius around chosen edges", ge=0)
-    factors_per_keyframe: int = opt(6, "directed edges per keyframe at most", ge=2)
+    nms: int = opt(3, "suppression radius around chosen edges", ge=0)
+    factors_per_keyframe: int = opt(10, "directed edges per keyframe at most", ge=2)
 
 
 @dataclass
 class FillerConfig:
     """Poses of the frames that are not keyframes."""
 
-    updates: int = opt(3, "motion-only update steps per batch", ge=0)
+    updates: int = opt(2, "motion-only update steps per batch", ge=0)
     batch: int = opt(16, "frames per batch", ge=1)
     cache_mb: int = opt(
         512, "memory for what correspondence keeps of frames; beyond it they are read again", ge=0
@@ -212,8 +211,8 @@ class DroidwConfig:
             "init_blind": PhaseConfig(updates=8, weigh=False),
             "init": PhaseConfig(updates=8),
             "init_again": PhaseConfig(updates=0),
-            "window": PhaseConfig(updates=2),
-            "window_kept": PhaseConfig(updates=2),
+            "window": PhaseConfig(updates=1),
+            "window_kept": PhaseConfig(updates=1),
             "global": PhaseConfig(updates=0, learn=False, depth_prior=False),
             "fill": PhaseConfig(updates=0, learn=False, depth_prior=False),
         },
@@ -222,7 +221,7 @@ class DroidwConfig:
         },
     )
     solver: SolverConfig = field(default_factory=SolverConfig)
-    global_solver: SolverConfig = field(default_factory=lambda: SolverConfig(lm=1e-5, ep=1e-2))
+    global_solver: SolverConfig = field(default_factory=lambda: SolverConfig(lm=1e-6, ep=1e-4))
     filler_solver: SolverConfig = field(default_factory=SolverConfig)
 
     device: str = opt("auto", "auto, cpu, cuda, cuda:N")

@@ -107,7 +107,7 @@ class FlowCorrespondence:
 
     def session(self, purpose: Purpose = "window") -> _FlowSession:
         """Fresh edge state; flows already measured are shared between sessions."""
-        return _FlowSession(self, one_way=purpose == "fill")
+        return _FlowSession(self, one_way=purpose == "fill", fine=purpose == "global")
 
     # -- measuring -------------------------------------------------------------------------
 
@@ -122,17 +122,21 @@ class FlowCorrespondence:
             return Motion(float(np.median(length)) / self.stride, matched)
         return Motion(float(length.mean()) / self.stride, matched)
 
-    def _search(self, a: FlowFrame, b: FlowFrame, start: Array | None = None) -> Array:
-        """Dense flow a -> b, [H,W,2] pixels."""
+    def _search(
+        self, a: FlowFrame, b: FlowFrame, start: Array | None = None, fine: bool = False
+    ) -> Array:
+        """Dense flow a -> b, [H,W,2] pixels; `fine` at the scale of global adjustment."""
         # An engine remembers that it was once given a start, and answers differently ever after:
         # one for each use, or the result would depend on which thread did what before.
-        name = "free" if start is None else "started"
+        scale = self.options.global_scale if fine else self.options.finest_scale
+        name = f"{'free' if start is None else 'started'}{scale}"
         engine = getattr(self._local, name, None)
         if engine is None:
             engine = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-            engine.setFinestScale(self.options.finest_scale)
+            engine.setFinestScale(scale)
             engine.setGradientDescentIterations(self.options.iterations)
             engine.setVariationalRefinementIterations(self.options.refinement)
+            engine.setPatchSize(self.options.patch_size)
             engine.setPatchStride(self.options.patch_stride)
             setattr(self._local, name, engine)
         flow: Array = engine.calc(a.grey, b.grey, None if start is None else start.copy())
@@ -196,7 +200,12 @@ class FlowCorrespondence:
         return _Edge((a.centres + moved - self.offset) / self.stride, confidence, None)
 
     def both_ways(
-        self, a: FlowFrame, b: FlowFrame, start_ab: Array | None, start_ba: Array | None
+        self,
+        a: FlowFrame,
+        b: FlowFrame,
+        start_ab: Array | None,
+        start_ba: Array | None,
+        fine: bool = False,
     ) -> tuple[_Edge, _Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
@@ -211,11 +220,11 @@ class FlowCorrespondence:
         if start_ab is None:
             ab = self._forward(a, b)
         else:
-            ab = self._search(a, b, self._dense(start_ab, a))
+            ab = self._search(a, b, self._dense(start_ab, a), fine)
         if start_ba is None:
             ba = self._forward(b, a)
         else:
-            ba = self._search(b, a, self._dense(start_ba, b))
+            ba = self._search(b, a, self._dense(start_ba, b), fine)
         both = self._checked(a, ab, ba, start_ab), self._checked(b, ba, ab, start_ba)
         with self._lock:
             self._pairs[key] = both
@@ -267,9 +276,10 @@ class FlowCorrespondence:
 class _FlowSession:
     """Edges measured once, and again when geometry says that the search went elsewhere."""
 
-    def __init__(self, owner: FlowCorrespondence, *, one_way: bool) -> None:
+    def __init__(self, owner: FlowCorrespondence, *, one_way: bool, fine: bool) -> None:
         self._owner = owner
         self._one_way = one_way
+        self._fine = fine
         self._edges: dict[int, _Edge] = {}
 
     def forget(self, ids: list[int]) -> None:
@@ -337,7 +347,7 @@ class _FlowSession:
         def job(key: tuple[int, int], rows: dict[bool, int]) -> Callable[[], Any]:
             a, b = request.payload(key[0]), request.payload(key[1])
             starts = start(rows.get(True)), start(rows.get(False))
-            return lambda: self._owner.both_ways(a, b, *starts)
+            return lambda: self._owner.both_ways(a, b, *starts, self._fine)
 
         measured = self._owner.map([job(key, rows) for key, rows in pairs.items()])
         for rows, both in zip(pairs.values(), measured, strict=True):

@@ -17,17 +17,24 @@ class FlowOptions:
 
     stride: int = field(default=8, metadata={"help": "grid cell in pixels", "ge": 2, "le": 16})
     finest_scale: int = field(
-        default=0,
+        default=1,
         metadata={"help": "finest pyramid level of the search (0: full size)", "ge": 0, "le": 3},
     )
+    global_scale: int = field(
+        default=1,
+        metadata={"help": "the same for global bundle adjustment", "ge": 0, "le": 3},
+    )
     iterations: int = field(
-        default=4, metadata={"help": "gradient descent iterations per patch", "ge": 1, "le": 100}
+        default=12, metadata={"help": "gradient descent iterations per patch", "ge": 1, "le": 100}
+    )
+    patch_size: int = field(
+        default=8, metadata={"help": "side of the patches of the search, pixels", "ge": 4, "le": 32}
     )
     patch_stride: int = field(
-        default=6, metadata={"help": "pixels between the patches of the search", "ge": 1, "le": 8}
+        default=4, metadata={"help": "pixels between the patches of the search", "ge": 1, "le": 8}
     )
     refinement: int = field(
-        default=0, metadata={"help": "variational refinement iterations", "ge": 0, "le": 20}
+        default=3, metadata={"help": "variational refinement iterations", "ge": 0, "le": 20}
     )
     consistency: float = field(
         default=0.5,
