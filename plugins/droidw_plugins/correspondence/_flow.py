@@ -28,6 +28,8 @@ Array = npt.NDArray[np.float32]
 _FULL_FIELDS = 24
 # Grid flows kept for the filler: some ten kilobytes each.
 _GRID_FIELDS = 20_000
+# Median distance of two starts, in cells, that lead to the same result.
+_SAME_START = 0.15
 # Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
 _FLAT = 0.1
 # Checked pairs kept for the next session that asks for them: some forty kilobytes each.
@@ -72,7 +74,7 @@ class FlowCorrespondence:
         self._lock = threading.Lock()
         self._full: OrderedDict[tuple[int, int], Array] = OrderedDict()
         self._grid: OrderedDict[tuple[int, int], tuple[Array, Array]] = OrderedDict()
-        self._pairs: OrderedDict[tuple[int, int], tuple[_Edge, _Edge]] = OrderedDict()
+        self._pairs: OrderedDict[tuple[int, int, bool], tuple[_Edge, _Edge]] = OrderedDict()
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
         """Grey image and texture at the cells."""
@@ -209,14 +211,16 @@ class FlowCorrespondence:
     ) -> tuple[_Edge, _Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
-        Without a start the answer of an earlier session is as good as a new one.
+        What an earlier session found from about the same start is as good as a new search.
         """
-        key = (a.index, b.index)
-        if start_ab is None and start_ba is None:
-            with self._lock:
-                known = self._pairs.get(key)
-            if known is not None:
-                return replace(known[0]), replace(known[1])
+        key = (a.index, b.index, fine)
+        with self._lock:
+            known = self._pairs.get(key)
+        if known is not None and all(
+            _close(edge.started, start)
+            for edge, start in zip(known, (start_ab, start_ba), strict=True)
+        ):
+            return replace(known[0]), replace(known[1])
         if start_ab is None:
             ab = self._forward(a, b)
         else:
@@ -356,6 +360,13 @@ class _FlowSession:
                 old = self._edges.get(request.ids[row])
                 edge.searches = old.searches + 1 if old else 1
                 self._edges[request.ids[row]] = edge
+
+
+def _close(one: Array | None, other: Array | None) -> bool:
+    """Whether two searches start from about the same place: both free, or within a pixel or so."""
+    if one is None or other is None:
+        return one is other
+    return bool(np.median(np.abs(one - other)) < _SAME_START)
 
 
 def _at(values: Any, points: Array, outside: float | None = None) -> Array:
