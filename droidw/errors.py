@@ -67,7 +67,7 @@ class MissingRequirementError(DroidwError):
 
 
 class PluginError(DroidwError):
-    """A plugin broke the contract of its kind: a bug of that plugin, named with its distribution."""
+    """A plugin broke the contract of its kind: its bug, named with its distribution."""
 
     exit_code = 5
 

@@ -111,7 +111,8 @@ class FrontendConfig:
     warmup: int = opt(8, "keyframes before initialisation", ge=2)
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     init_beta: float = opt(0.25, "the same during initialisation", ge=0, le=1)
-    keyframe_threshold: float = opt(0.6, "distance below which the newest keyframe is dropped", ge=0
+    keyframe_threshold: float = opt(
+        0.6, "distance below which the newest keyframe is dropped", ge=0
     )
     threshold: float = opt(8.0, "largest frame distance of a proximity edge, in cells", gt=0)
     window: int = opt(25, "keyframes searched for proximity edges", ge=2)

@@ -74,7 +74,7 @@ class KeyframeStore:
             StoreField("uncertainty", ("h", "w")),
             StoreField("damping", ("h", "w"), fill=1e-6),
         )
-        self._declared = {}
+        self._declared: dict[str, StoreField] = {}
         sizes = {"h": grid.height, "w": grid.width, "c": feature_dim}
         for declared in (*core, *fields):
             if declared.name in self._declared:

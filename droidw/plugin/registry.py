@@ -174,7 +174,7 @@ class Registry:
         return self.entry(name).component
 
     def status(self, name: str) -> str:
-        """ "ready", or in a few words why the part cannot be used.
+        """Say "ready", or in a few words why the part cannot be used.
 
         Examples: "needs droidw[open3d]", "weights missing: droid.pth", "no GPU visible".
 

@@ -41,7 +41,7 @@ from droidw.slam.system import Outcome, SlamSystem
 
 if TYPE_CHECKING:
     from droidw.config.resolve import ResolvedConfig
-    from droidw.interfaces.datasets import FrameSource
+    from droidw.interfaces.datasets import DatasetReader, FrameSource
     from droidw.plugin.manager import Plugins
     from droidw.slam.frame import Frame, RawFrame
     from droidw.slam.timing import Stopwatch
@@ -224,13 +224,14 @@ class _Run:
         selection = Selection(given.stride, given.skip, given.max_frames)
         if "reader" in self.resolved.parts:
             component, options = self.resolved.parts["reader"]
-            return component.factory(options, self.context).open(given.source, selection)
+            chosen: DatasetReader = component.factory(options, self.context)
+            return chosen.open(given.source, selection)
         registry = self.plugins.registry("reader")
         for name in registry.names():
             if registry.status(name) != "ready":
                 continue
             component = registry.get(name)
-            reader = component.factory(component.options(), self.context)
+            reader: DatasetReader = component.factory(component.options(), self.context)
             if reader.recognises(given.source):
                 _log.info(f"reader: {name}")
                 return reader.open(given.source, selection)

@@ -1,4 +1,4 @@
-"""The orchestrator: frames in, trajectory and keyframes out, one process (DESIGN, way of a frame)."""
+"""The orchestrator: frames in, trajectory and keyframes out, in one process."""
 
 from __future__ import annotations
 

@@ -132,9 +132,9 @@ class FlowCorrespondence:
         # one for each use, or the result would depend on which thread did what before.
         scale = self.options.global_scale if fine else self.options.finest_scale
         name = f"{'free' if start is None else 'started'}{scale}"
-        engine = getattr(self._local, name, None)
+        engine: Any = getattr(self._local, name, None)
         if engine is None:
-            engine = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+            engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
             engine.setFinestScale(scale)
             engine.setGradientDescentIterations(self.options.iterations)
             engine.setVariationalRefinementIterations(self.options.refinement)
@@ -199,7 +199,8 @@ class FlowCorrespondence:
             known = self._one_way(a, b, self._search(a, b))
         moved, agrees = known
         confidence = agrees[..., None] * self._texture_weight(a)
-        return _Edge((a.centres + moved - self.offset) / self.stride, confidence, None)
+        target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
+        return _Edge(target, confidence, None)
 
     def both_ways(
         self,
@@ -243,14 +244,15 @@ class FlowCorrespondence:
         rows = np.float32(np.clip((np.arange(height) - self.offset) / self.stride, 0, None))
         cols = np.float32(np.clip((np.arange(width) - self.offset) / self.stride, 0, None))
         map_x, map_y = np.meshgrid(cols, rows)
-        dense: Array = cv2.remap(
+        dense = cv2.remap(
             np.ascontiguousarray(flow, dtype=np.float32),
             map_x,
             map_y,
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_REPLICATE,
         )
-        return np.clip(dense, -2.0 * width, 2.0 * width)
+        bounded: Array = np.clip(dense, -2.0 * width, 2.0 * width).astype(np.float32)
+        return bounded
 
     def _checked(self, a: FlowFrame, ab: Array, ba: Array, started: Array | None) -> _Edge:
         moved = _at(ab, a.centres)
@@ -261,7 +263,8 @@ class FlowCorrespondence:
         confidence = 1.0 / (1.0 + error2 / opt.consistency**2)
         confidence[error2 > opt.cutoff**2] = 0.0
         weight = confidence[..., None].astype(np.float32) * self._texture_weight(a)
-        return _Edge((there - self.offset) / self.stride, weight, started)
+        target = ((there - self.offset) / self.stride).astype(np.float32)
+        return _Edge(target, weight, started)
 
     def _texture_weight(self, a: FlowFrame) -> Array:
         if self.options.texture <= 0:
@@ -372,7 +375,7 @@ def _close(one: Array | None, other: Array | None) -> bool:
 def _at(values: Any, points: Array, outside: float | None = None) -> Array:
     """Bilinear samples of [H,W(,C)] at points [h,w,2]; edge values (or `outside`) beyond."""
     mode = cv2.BORDER_REPLICATE if outside is None else cv2.BORDER_CONSTANT
-    sampled: Array = cv2.remap(
+    sampled = cv2.remap(
         values,
         np.ascontiguousarray(points[..., 0], dtype=np.float32),
         np.ascontiguousarray(points[..., 1], dtype=np.float32),
@@ -380,4 +383,5 @@ def _at(values: Any, points: Array, outside: float | None = None) -> Array:
         borderMode=mode,
         borderValue=(outside or 0.0,) * 4,
     )
-    return sampled.astype(np.float32, copy=False)
+    result: Array = sampled.astype(np.float32, copy=False)
+    return result
