@@ -35,6 +35,12 @@ class _Sentence(logging.Formatter):
 class _Console(_Stream):
     """The handler that `set_up` puts in place, recognisable so that it is never doubled."""
 
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record, on a terminal over the live line that may stand there."""
+        if self.stream.isatty():
+            self.stream.write("\r\x1b[K")
+        super().emit(record)
+
 
 def quiet_library() -> None:
     """Let a program that imports droidw decide about logging: a handler that drops everything."""

@@ -77,6 +77,8 @@ def main(args: argparse.Namespace) -> int:
         for flag, key in _FLAGS.items()
         if getattr(args, flag) is not None
     ]
+    if args.quiet:
+        overrides.append("observers.progress.enabled=false")
     result = execute(
         plugins_from(args),
         [Path(f) for f in args.config],

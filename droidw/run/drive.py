@@ -24,6 +24,7 @@ from droidw.errors import (
     MissingRequirementError,
     TrackingError,
 )
+from droidw.eval.masks import score_folder
 from droidw.eval.metrics import score
 from droidw.events import Dispatcher, Progress, RunFailed, RunFinished, RunStarted
 from droidw.geometry.camera import Rectifier
@@ -294,8 +295,6 @@ class _Run:
             manifest=self._manifest(system, source, outcome, rectify, elapsed),
             run_dir=self.run_dir,
         )
-        if metrics is not None:
-            write_json(self.run_dir / "metrics.json", metrics)
         total = len(self.resolved.exporters)
         with system.clock("export"):
             for done, (component, options) in enumerate(self.resolved.exporters):
@@ -304,6 +303,9 @@ class _Run:
                 except (DroidwError, OSError) as error:
                     warnings.warn(f"exporter '{component.name}' failed: {error}")
                 self.events.emit(Progress("export", done + 1, total))
+        metrics = self._score_masks(metrics)
+        if metrics is not None:
+            write_json(self.run_dir / "metrics.json", metrics)
         manifest = self._manifest(
             system, source, outcome, rectify, time.perf_counter() - self.started
         )
@@ -320,6 +322,17 @@ class _Run:
         except DroidwError as error:
             self.events.warn(f"the trajectory was not scored: {error.message}")
             return None
+
+    def _score_masks(self, metrics: dict[str, Any] | None) -> dict[str, Any] | None:
+        """Add the score of the written uncertainty maps, where the source has motion masks."""
+        masks, maps = Path(self.config.input.source) / "mask", self.run_dir / "uncertainty"
+        if not masks.is_dir() or not maps.is_dir():
+            return metrics
+        try:
+            return {**(metrics or {}), "masks": score_folder(maps, masks).to_dict()}
+        except DroidwError as error:
+            self.events.warn(f"the uncertainty was not scored: {error.message}")
+            return metrics
 
     def _manifest(
         self,
@@ -402,6 +415,8 @@ def _seed(seed: int, threads: int) -> None:
     random.seed(seed)
     np.random.seed(seed)
     torch.manual_seed(seed)
-    torch.set_num_threads(threads or os.cpu_count() or 1)
+    # Half of the cores for torch: the other half decodes and searches flow at the same time, and
+    # torch's threads wait for each other, which costs far more than they gain on a busy core.
+    torch.set_num_threads(max(1, (threads or os.cpu_count() or 1) // 2))
     # OpenCV's own threads make optical flow depend on their number; droidw runs its own.
     cv2.setNumThreads(1)
