@@ -37,7 +37,7 @@ class _Console(_Stream):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record, on a terminal over the live line that may stand there."""
-        if self.stream.isatty():
+        if not self.stream.closed and self.stream.isatty():
             self.stream.write("\r\x1b[K")
         super().emit(record)
 

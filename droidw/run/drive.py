@@ -34,7 +34,7 @@ from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
 from droidw.run.cameras import choose_camera
 from droidw.run.folder import FILES, prepare, write_json, write_text
-from droidw.run.manifest import describe_parts, peak_memory_mb, versions
+from droidw.run.manifest import REPORTS, facts_of_setup, facts_of_time, facts_of_tracking
 from droidw.run.signals import Stop
 from droidw.slam.frame import RunResult
 from droidw.slam.optimise import Parts
@@ -273,7 +273,7 @@ class _Run:
         for text in outcome.diagnosis.warnings():
             warnings.warn(text)
         for status, count in system.optimiser.reports.items():
-            warnings.warn(_REPORTS.get(status, "{count} steps: " + status).format(count=count))
+            warnings.warn(REPORTS.get(status, "{count} steps: " + status).format(count=count))
         if source.skipped:
             shown = "; ".join(source.problems[:3])
             warnings.warn(f"{source.skipped} pictures could not be used: {shown}")
@@ -282,7 +282,6 @@ class _Run:
                 warnings.warn(text)
         truth = source.truth
         metrics = self._score(outcome, truth)
-        elapsed = time.perf_counter() - self.started
         result = RunResult(
             trajectory=outcome.trajectory,
             keyframes=outcome.keyframes,
@@ -292,7 +291,7 @@ class _Run:
             offset=system.grid.offset,
             source=self.config.input.source,
             truth=truth,
-            manifest=self._manifest(system, source, outcome, rectify, elapsed),
+            manifest=self._manifest(system, source, outcome, rectify),
             run_dir=self.run_dir,
         )
         total = len(self.resolved.exporters)
@@ -306,9 +305,7 @@ class _Run:
         metrics = self._score_masks(metrics)
         if metrics is not None:
             write_json(self.run_dir / "metrics.json", metrics)
-        manifest = self._manifest(
-            system, source, outcome, rectify, time.perf_counter() - self.started
-        )
+        manifest = self._manifest(system, source, outcome, rectify)
         result = replace(result, manifest=manifest, warnings=tuple(warnings.warnings))
         write_json(self.run_dir / "manifest.json", {**manifest, "warnings": warnings.warnings})
         self.events.emit(RunFinished(result, self.run_dir, metrics))
@@ -335,64 +332,26 @@ class _Run:
             return metrics
 
     def _manifest(
-        self,
-        system: SlamSystem,
-        source: FrameSource,
-        outcome: Outcome,
-        rectify: Rectifier,
-        elapsed: float,
+        self, system: SlamSystem, source: FrameSource, outcome: Outcome, rectify: Rectifier
     ) -> dict[str, Any]:
-        frames = len(outcome.trajectory)
-        working = rectify.camera
-        stages = dict(system.clock.seconds)
-        stages["start"] = self.built - self.started
         return {
             "source": self.config.input.source,
-            "frames": frames,
-            "last_frame": system.last_index,
-            "keyframes": len(outcome.keyframes),
-            "skipped": source.skipped,
-            "problems": source.problems[:100],
-            "seconds": round(elapsed, 3),
-            "fps": round(frames / max(elapsed - (self.built - self.started), 1e-9), 2),
-            "peak_memory_mb": round(peak_memory_mb(), 1),
-            "stages": {name: round(value, 4) for name, value in stages.items()},
+            **facts_of_tracking(system, source, outcome, rectify.camera),
+            **facts_of_time(
+                system,
+                len(outcome.trajectory),
+                self.built - self.started,
+                time.perf_counter() - self.started,
+            ),
             "camera": self.said,
-            "intrinsics": {
-                "width": working.width,
-                "height": working.height,
-                "fx": working.fx,
-                "fy": working.fy,
-                "cx": working.cx,
-                "cy": working.cy,
-            },
-            "scale": "metric, from the depth prior" if self._metric(system) else "arbitrary",
-            "preset": self.resolved.preset or "",
+            **facts_of_setup(self.resolved, self.device),
             "note": self.note,
-            "seed": self.config.seed,
-            "device": str(self.device),
-            "versions": versions(self.device),
-            "parts": describe_parts(self.resolved),
-            "config_yaml": self.resolved.to_yaml(),
             "files": {
                 name: meaning
                 for name, meaning in FILES.items()
                 if (self.run_dir / name).exists() or name in ("report.html", "manifest.json")
             },
         }
-
-    def _metric(self, system: SlamSystem) -> bool:
-        return bool(system.parts.depth.metric)
-
-
-_REPORTS = {
-    "rejected": "{count} bundle adjustment steps were rejected, since none lowered the energy",
-    "singular": "{count} bundle adjustment steps could not be solved (singular system)",
-    "nonfinite": "{count} bundle adjustment steps were not finite and were left out",
-    "empty": "{count} bundle adjustment steps had nothing to move",
-    "dropped": "{count} measurements that were not finite were left out",
-    "uncertainty": "{count} updates of the uncertainty model were not finite",
-}
 
 
 def _device(resolved: ResolvedConfig) -> torch.device:

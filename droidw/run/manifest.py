@@ -14,8 +14,19 @@ import droidw
 
 if TYPE_CHECKING:
     from droidw.config.resolve import ResolvedConfig
+    from droidw.geometry.camera import Camera
+    from droidw.interfaces.datasets import FrameSource
+    from droidw.slam.system import Outcome, SlamSystem
 
-__all__ = ["describe_parts", "peak_memory_mb", "versions"]
+__all__ = [
+    "REPORTS",
+    "describe_parts",
+    "facts_of_setup",
+    "facts_of_time",
+    "facts_of_tracking",
+    "peak_memory_mb",
+    "versions",
+]
 
 _PACKAGES = ("torch", "numpy", "opencv-python-headless", "kornia", "omegaconf", "pluggy", "av")
 
@@ -54,3 +65,61 @@ def peak_memory_mb() -> float:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # Linux counts kibibytes, macOS bytes.
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+REPORTS = {
+    "rejected": "{count} bundle adjustment steps were rejected, since none lowered the energy",
+    "singular": "{count} bundle adjustment steps could not be solved (singular system)",
+    "nonfinite": "{count} bundle adjustment steps were not finite and were left out",
+    "empty": "{count} bundle adjustment steps had nothing to move",
+    "dropped": "{count} measurements that were not finite were left out",
+    "uncertainty": "{count} updates of the uncertainty model were not finite",
+}
+"""What the optimiser counts -> the sentence for the user."""
+
+
+def facts_of_tracking(
+    system: SlamSystem, source: FrameSource, outcome: Outcome, camera: Camera
+) -> dict[str, Any]:
+    """How much was read and tracked, and with which working camera."""
+    return {
+        "frames": len(outcome.trajectory),
+        "last_frame": system.last_index,
+        "keyframes": len(outcome.keyframes),
+        "skipped": source.skipped,
+        "problems": source.problems[:100],
+        "intrinsics": {
+            "width": camera.width,
+            "height": camera.height,
+            "fx": camera.fx,
+            "fy": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+        },
+        "scale": "metric, from the depth prior" if system.parts.depth.metric else "arbitrary",
+    }
+
+
+def facts_of_time(
+    system: SlamSystem, frames: int, starting: float, elapsed: float
+) -> dict[str, Any]:
+    """Seconds in all and by stage, frames per second without the start, peak memory."""
+    stages = {**system.clock.seconds, "start": starting}
+    return {
+        "seconds": round(elapsed, 3),
+        "fps": round(frames / max(elapsed - starting, 1e-9), 2),
+        "peak_memory_mb": round(peak_memory_mb(), 1),
+        "stages": {name: round(value, 4) for name, value in stages.items()},
+    }
+
+
+def facts_of_setup(resolved: ResolvedConfig, device: torch.device) -> dict[str, Any]:
+    """Configuration, parts and versions."""
+    return {
+        "preset": resolved.preset or "",
+        "seed": resolved.config.seed,
+        "device": str(device),
+        "versions": versions(device),
+        "parts": describe_parts(resolved),
+        "config_yaml": resolved.to_yaml(),
+    }

@@ -202,10 +202,15 @@ def test_preset_auto(plugins):
     assert choose_preset(plugins)[0] == "paper"
 
 
-def test_preset_cpu_is_the_default(plugins):
+def test_preset_cpu_is_the_default_but_for_what_its_features_need():
+    plugins = droidw.load_plugins(environ={})
     chosen = resolve(load_config(preset="cpu"), plugins)
-    assert chosen.config == resolve(load_config(), plugins).config
+    default = resolve(load_config(), plugins)
     assert chosen.preset == "cpu"
+    assert chosen.config.uncertainty.name == default.config.uncertainty.name
+    assert chosen.config.uncertainty.options["lr"] == 0.3
+    chosen.config.uncertainty.options = default.config.uncertainty.options
+    assert chosen.config == default.config
 
 
 def test_nothing_heavy_is_loaded_to_refuse(plugins):
