@@ -120,7 +120,7 @@ class _Run:
     def go(self) -> RunResult:
         try:
             return self._go()
-        except DroidwError as error:
+        except Exception as error:
             self.events.emit(RunFailed(str(error)))
             raise
 
@@ -162,6 +162,10 @@ class _Run:
             RunStarted(self.config.input.source, self.run_dir, source.length, self._facts())
         )
         failure = self._track(system, frames)
+        if failure is not None and not system.frames:
+            raise failure
+        if not system.frames:
+            raise Interrupted("stopped by a signal before the first frame", self.stop.signum)
         outcome = system.finish(frames, brief=failure is not None or self.stop.signum > 0)
         result = self._export(system, source, outcome, rectify)
         self._conclude(failure, result, outcome)
@@ -188,10 +192,7 @@ class _Run:
         stream = frames()
         try:
             system.track(self.stop.until(stream))
-        except Exception as error:
-            if not system.frames:
-                raise
-            _log.debug("tracking stopped", exc_info=True)
+        except Exception as error:  # noqa: BLE001 - raised again once all is written
             self.events.warn(f"tracking stopped after {system.frames} frames: {error}")
             return error
         finally:
@@ -299,8 +300,10 @@ class _Run:
             for done, (component, options) in enumerate(self.resolved.exporters):
                 try:
                     component.factory(options, self.context).export(result, self.run_dir)
-                except (DroidwError, OSError) as error:
-                    warnings.warn(f"exporter '{component.name}' failed: {error}")
+                except Exception as error:  # noqa: BLE001 - one exporter must not cost the others
+                    _log.debug("exporter %s raised", component.name, exc_info=True)
+                    kind = "" if isinstance(error, DroidwError) else f"{type(error).__name__}: "
+                    warnings.warn(f"exporter '{component.name}' failed: {kind}{error}")
                 self.events.emit(Progress("export", done + 1, total))
         metrics = self._score_masks(metrics)
         if metrics is not None:
@@ -334,6 +337,10 @@ class _Run:
     def _manifest(
         self, system: SlamSystem, source: FrameSource, outcome: Outcome, rectify: Rectifier
     ) -> dict[str, Any]:
+        # written after the manifest has been put together
+        later = {"manifest.json"}
+        if any(part.name == "report" for part, _ in self.resolved.observers):
+            later.add("report.html")
         return {
             "source": self.config.input.source,
             **facts_of_tracking(system, source, outcome, rectify.camera),
@@ -349,7 +356,7 @@ class _Run:
             "files": {
                 name: meaning
                 for name, meaning in FILES.items()
-                if (self.run_dir / name).exists() or name in ("report.html", "manifest.json")
+                if (self.run_dir / name).exists() or name in later
             },
         }
 
