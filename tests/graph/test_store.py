@@ -22,8 +22,7 @@ def empty():
 def append(store, tag):
     """A keyframe whose every value is `tag`."""
     info = KeyframeInfo(tag, tag / 10, f"{tag}", np.full((1, 1, 3), tag % 256, np.uint8), tag)
-    values = {name: torch.full_like(store[name][:0].new_empty(store._data[name].shape[1:]), tag)
-              for name in FIELDS}  # fmt: skip
+    values = {name: torch.full(store[name].shape[1:], tag) for name in FIELDS}
     return store.append(info, **values)
 
 
@@ -31,9 +30,9 @@ def tags(store):
     """The tag of each keyframe, once per field; they have to agree in all values."""
     held = {}
     for name in FIELDS:
-        flat = store[name].double().reshape(len(store), -1)
-        assert (flat == flat[:, :1]).all(), f"{name} is torn"
-        held[name] = flat[:, 0].long().tolist()
+        values = [store[name][k].double().flatten() for k in range(len(store))]
+        assert all((v == v[0]).all() for v in values), f"{name} is torn"
+        held[name] = [int(v[0]) for v in values]
     return held
 
 

@@ -52,7 +52,9 @@ class Footage(NamedTuple):
 def footage(tmp_path):
     """Write a folder of pictures: `footage("handheld", count=20, blank=range(8, 10))`."""
 
-    def write(motion="handheld", count=None, *, name="clip", times=None, blank=(), calib=None):
+    def write(
+        motion="handheld", count=None, *, name="clip", times=None, blank=(), grey=90, calib=None
+    ):
         images, scene = pictures(motion)
         images = images[:count]
         times = [k / 30 for k in range(len(images))] if times is None else times
@@ -60,7 +62,7 @@ def footage(tmp_path):
         (folder / "rgb").mkdir(parents=True)
         lines = []
         for k, image in enumerate(images):
-            shown = np.full_like(image, 90) if k in blank else image
+            shown = np.full_like(image, grey) if k in blank else image
             cv2.imwrite(str(folder / "rgb" / f"{k:04d}.png"), shown[..., ::-1])
             lines.append(f"{times[k]:.6f} rgb/{k:04d}.png")
         (folder / "rgb.txt").write_text("\n".join(lines) + "\n")

@@ -1,0 +1,161 @@
+"""Output folders that cannot be used, parts that fail, and what a run leaves all the same."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+RAISING = """
+import droidw
+
+class Deaf:
+    def on_event(self, event):
+        raise RuntimeError(f"cannot hear {type(event).__name__}")
+
+class Clumsy:
+    def export(self, result, folder):
+        (folder / "half.txt").write_text("half")
+        raise ValueError("the printer is on fire")
+
+@droidw.hookimpl
+def droidw_observers():
+    yield droidw.Component("deaf", "raises", lambda options, context: Deaf())
+
+@droidw.hookimpl
+def droidw_exporters():
+    yield droidw.Component("aa-clumsy", "raises", lambda options, context: Clumsy())
+"""
+
+
+@pytest.fixture
+def plugin(tmp_path):
+    """A plugin in one file."""
+
+    def write(text):
+        path = tmp_path / "mine.py"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def test_what_a_run_leaves(go, footage):
+    ran = go(footage(count=12).folder, "observers.report={}")
+    assert ran.code == 0, ran.err
+    held = {path.name for path in ran.folder.iterdir()}
+    assert {"trajectory.tum", "keyframes.tum", "points.ply", "report.html", "config.yaml",
+            "manifest.json", "log.txt"} <= held  # fmt: skip
+    assert set(ran.manifest["files"]) == held
+    for name in held:
+        assert name in ran.out
+
+
+def test_files_that_are_not_there_are_not_announced(go, footage):
+    ran = go(footage(count=3).folder, "exporters.ply=null")
+    held = {path.name for path in ran.folder.iterdir()}
+    assert set(ran.manifest["files"]) == held
+    assert "report.html" not in ran.out and "points.ply" not in ran.out
+
+
+def test_a_file_in_the_way(go, footage, tmp_path):
+    (tmp_path / "out").write_text("precious")
+    ran = go(footage(count=3).folder)
+    assert ran.code == 2
+    assert "a file of that name is in the way" in ran.err
+    assert (tmp_path / "out").read_text() == "precious"
+
+
+def test_a_file_in_place_of_a_parent(go, footage, tmp_path):
+    (tmp_path / "out").write_text("precious")
+    ran = go(footage(count=3).folder, to="out/deeper")
+    assert ran.code == 2
+    assert "in the way" in ran.err
+
+
+def test_a_folder_that_may_not_be_written(go, footage, monkeypatch):
+    allowed = os.access
+
+    def access(path, mode, **more):
+        return Path(path).name != "out" and allowed(path, mode, **more)
+
+    monkeypatch.setattr(os, "access", access)
+    ran = go(footage(count=3).folder)
+    assert ran.code == 2
+    assert "cannot be written to" in ran.err
+
+
+def test_a_filled_folder_needs_overwrite(go, footage):
+    clip = footage(count=8)
+    first = go(clip.folder)
+    kept = (first.folder / "trajectory.tum").read_bytes()
+    (first.folder / "notes.txt").write_text("mine")
+    again = go(clip.folder, "--max-frames", "3")
+    assert again.code == 2
+    assert "is not empty" in again.err and "--overwrite" in again.err
+    assert (first.folder / "trajectory.tum").read_bytes() == kept
+    third = go(clip.folder, "--max-frames", "3", "--overwrite")
+    assert third.code == 0, third.err
+    assert len(third.poses) == 3
+    assert (first.folder / "notes.txt").read_text() == "mine"
+
+
+def test_overwrite_spares_what_is_no_run(go, footage, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("years of work")
+    ran = go(footage(count=3).folder, "--overwrite")
+    assert ran.code == 2
+    assert "this is none" in ran.err
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["thesis.tex"]
+
+
+def test_the_footage_is_never_the_output(go, footage):
+    clip = footage(count=3)
+    before = sorted(p.name for p in clip.folder.iterdir())
+    ran = go(clip.folder, "--overwrite", to="clip")
+    assert ran.code == 2
+    assert sorted(p.name for p in clip.folder.iterdir()) == before
+
+
+def test_parts_that_raise_lose_nothing(go, footage, plugin):
+    clip = footage()
+    ran = go(
+        clip.folder, "--plugin", plugin(RAISING),
+        "observers.deaf={}", "exporters.aa-clumsy={}", "observers.report={}",
+    )  # fmt: skip
+    assert ran.code == 0, ran.err
+    assert len(ran.poses) == len(clip.times)
+    assert {"keyframes.tum", "points.ply", "report.html"} <= {p.name for p in ran.folder.iterdir()}
+    assert "observer 'deaf' raised RuntimeError: cannot hear RunStarted" in ran.warnings
+    assert ran.err.count("cannot hear") == 1
+    assert "exporter 'aa-clumsy' failed" in ran.warnings
+    assert "the printer is on fire" in ran.warnings
+
+
+BREAKS = """
+import droidw
+
+class Bomb:
+    dim = 0
+    def __init__(self):
+        self.left = 3
+    def extract(self, image, grid):
+        self.left -= 1
+        if self.left < 0:
+            raise RuntimeError("out of ideas")
+        return image.new_zeros(0, grid.height, grid.width)
+
+@droidw.hookimpl
+def droidw_feature_extractors():
+    yield droidw.Component("bomb", "raises at the fourth keyframe", lambda o, c: Bomb())
+"""
+
+
+def test_a_part_that_breaks_while_tracking_keeps_what_was_tracked(go, footage, plugin):
+    ran = go(footage().folder, "--plugin", plugin(BREAKS), "features=bomb")
+    assert ran.code == 1
+    assert "out of ideas" in ran.err
+    assert "tracking stopped after" in ran.warnings
+    assert 5 < len(ran.poses) < 26
+    assert len(ran.poses) == ran.manifest["frames"]

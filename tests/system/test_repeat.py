@@ -1,0 +1,101 @@
+"""The same run twice, a run from its own configuration, and frame by frame from Python."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import droidw
+from droidw.config.load import load_config
+from droidw.config.resolve import resolve
+from droidw.events import Dispatcher
+from droidw.geometry.camera import Rectifier
+from droidw.plugin.component import BuildContext
+from droidw.slam.frame import RawFrame
+from droidw.slam.optimise import Parts
+from droidw.slam.system import SlamSystem
+
+ALL_PARTS = ("features=cnn", "uncertainty=affine-softplus", "threads=2")
+
+
+def test_one_seed_gives_the_same_bytes(go, footage):
+    clip = footage()
+    one, two = (go(clip.folder, *ALL_PARTS, "--seed", "5", to=name) for name in "ab")
+    assert one.code == two.code == 0, one.err + two.err
+    assert one.manifest["seed"] == 5
+    for name in ("trajectory.tum", "keyframes.tum", "points.ply"):
+        assert (one.folder / name).read_bytes() == (two.folder / name).read_bytes(), name
+
+
+def test_the_configuration_of_a_run_runs_again(go, footage):
+    clip = footage()
+    one = go(clip.folder, "--seed", "3", "--stride", "2", *ALL_PARTS, to="a")
+    assert one.code == 0, one.err
+    two = go(None, "--config", one.folder / "config.yaml", to="b", quick=False)
+    assert two.code == 0, two.err
+    for name in ("trajectory.tum", "points.ply"):
+        assert (one.folder / name).read_bytes() == (two.folder / name).read_bytes(), name
+    one_config, two_config = (
+        load_config([ran.folder / "config.yaml"]).values for ran in (one, two)
+    )
+
+
+def test_frames_that_do_not_fit_in_memory_are_read_again(go, footage):
+    clip = footage()
+    held = go(clip.folder, to="a")
+    read = go(clip.folder, "filler.cache_mb=0", to="b")
+    assert read.code == 0, read.err
+    assert (held.folder / "trajectory.tum").read_bytes() == (
+        read.folder / "trajectory.tum"
+    ).read_bytes()
+
+
+@pytest.fixture
+def system(quick, rendered):
+    """Build a system and the frames for it, from Python."""
+
+    def make(threaded=False):
+        plugins = droidw.load_plugins(environ={})
+        config = load_config([], "cpu", list(quick[2:]))
+        resolved = resolve(config, plugins)
+        context = BuildContext(torch.device("cpu"), run_dir=Path("/nonexistent"))
+
+        def part(slot):
+            component, options = resolved.parts[slot]
+            return component.factory(options, context)
+
+        slots = ("features", "depth", "uncertainty", "ba", "correspondence")
+        images, scene = rendered("handheld")
+        rectify = Rectifier(scene.camera, long_side=160)
+        frames = [rectify(RawFrame(k, k / 30, image, str(k))) for k, image in enumerate(images)]
+        parts = Parts(**{slot: part(slot) for slot in slots})
+        slam = SlamSystem(
+            resolved.config, parts, rectify.camera, torch.device("cpu"), Dispatcher(),
+            threaded=threaded,
+        )  # fmt: skip
+        return slam, frames
+
+    return make
+
+
+def test_frame_by_frame_equals_all_at_once(system):
+    outcomes = []
+    for mode in ("push", "track", "ahead"):
+        slam, frames = system(threaded=mode == "ahead")
+        if mode == "push":
+            kept = [slam.push(frame) for frame in frames]
+            assert kept[0] and 4 <= sum(kept) < len(frames)
+        else:
+            slam.track(iter(frames))
+        assert slam.frames == len(frames) and slam.last_index == len(frames) - 1
+        outcomes.append(slam.finish(lambda frames=frames: iter(frames)))
+    first = outcomes[0]
+    assert len(first.trajectory) == 26
+    for other in outcomes[1:]:
+        assert np.array_equal(first.trajectory.T_wc, other.trajectory.T_wc)
+        assert np.array_equal(first.trajectory.times, other.trajectory.times)
+        assert np.array_equal(first.cloud.xyz, other.cloud.xyz)
+        assert [k.index for k in first.keyframes] == [k.index for k in other.keyframes]
