@@ -18,9 +18,7 @@ def test_for_another_size_of_the_same_shape_is_scaled(go, footage, tmp_path):
 
 
 def test_of_the_source_for_another_size_is_scaled(go, footage):
-    clip = footage(
-        count=6, calib="width 320\nheight 240\nfx 262.4\nfy 262.4\ncx 159.5\ncy 119.5\n"
-    )
+    clip = footage(count=6, calib="width 320\nheight 240\nfx 262.4\nfy 262.4\ncx 159.5\ncy 119.5\n")
     ran = go(clip.folder)
     assert ran.code == 0, ran.err
     assert ran.manifest["intrinsics"]["fx"] == pytest.approx(131.2)

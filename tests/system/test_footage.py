@@ -180,7 +180,9 @@ def test_pure_rotation(go, footage, rendered):
     assert "almost no parallax" in ran.warnings
     _, scene = rendered("rotation")
     truth = scene.trajectory.T_wc[:, 3:]
-    turned = [np.degrees(2 * np.arccos(min(1, abs(q[-1] @ q[0])))) for q in (ran.poses[:, 4:], truth)]
+    turned = [
+        np.degrees(2 * np.arccos(min(1, abs(q[-1] @ q[0])))) for q in (ran.poses[:, 4:], truth)
+    ]
     assert turned[0] == pytest.approx(turned[1], rel=0.15), "rotations are said to be usable"
 
 

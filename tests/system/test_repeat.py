@@ -38,9 +38,8 @@ def test_the_configuration_of_a_run_runs_again(go, footage):
     assert two.code == 0, two.err
     for name in ("trajectory.tum", "points.ply"):
         assert (one.folder / name).read_bytes() == (two.folder / name).read_bytes(), name
-    one_config, two_config = (
-        load_config([ran.folder / "config.yaml"]).values for ran in (one, two)
-    )
+    settings = [load_config([ran.folder / "config.yaml"]).data for ran in (one, two)]
+    assert settings[0] == settings[1]
 
 
 def test_frames_that_do_not_fit_in_memory_are_read_again(go, footage):

@@ -70,7 +70,7 @@ def test_a_signal_keeps_what_was_tracked(tmp_path, quick, signum, code):
         while not (out / "tracked").exists() and process.poll() is None:
             time.sleep(0.05)
         process.send_signal(signum)
-        said, wrong = process.communicate(timeout=120)
+        _, wrong = process.communicate(timeout=120)
     finally:
         process.kill()
     assert process.returncode == code, wrong
