@@ -22,7 +22,9 @@ __all__ = ["consistent_depth", "static_cloud"]
 _REACH = 3
 
 
-def consistent_depth(store: KeyframeStore, relative_threshold: float, min_views: int) -> Tensor:
+def consistent_depth(
+    store: KeyframeStore, relative_threshold: float, min_views: int, min_disp: float
+) -> Tensor:
     """Cells whose depth at least `min_views` neighbouring keyframes confirm, [N,h,w] bool.
 
     A neighbour confirms a cell if the depth that the cell would have there and the depth that
@@ -50,8 +52,10 @@ def consistent_depth(store: KeyframeStore, relative_threshold: float, min_views:
                 flat = (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).flatten(1)
                 seen = store.disps[jj].flatten(1).gather(1, flat).view_as(there)
                 agrees |= inside & ((there * seen - 1.0).abs() < relative_threshold)
+
         views[first:last] += (agrees & valid).long()
-    return views >= min_views
+    # A disparity at its lower bound is no measurement, however many views share it.
+    return (views >= min_views) & (store.disps > 1.01 * min_disp)
 
 
 def _depth_there(store: KeyframeStore, G: Tensor, ii: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -62,12 +63,46 @@ class Frontend:
         schedule, options = self.config.schedule, self.options
         self.graph.add(neighbour_edges(count, 3))
         self._updates("init_blind", first_free=1, informed=False)
+        self._try_reversed()
         for phase in ("init", "init_again"):
             if schedule[phase].updates:
                 self._propose(0, 0, options.init_beta, nms=2)
                 self._updates(phase, first_free=1)
         self._retire([r for r in self.graph.select() if self.graph.ii[r] < count - 4])
         self.initialised = True
+
+    def _try_reversed(self) -> None:
+        """Leave the mirrored solution if that is where the first keyframes have converged to.
+
+        Seen from afar, a scene with its depth turned inside out and the camera moving the other
+        way, turned so that the middle of the picture moves alike, explains the flow almost as
+        well, and Gauss-Newton cannot cross from one to the other. Both are tried, and the one of
+        lower energy stays.
+        """
+        store = self.store
+        found = store.T_cw.clone(), store.disps.clone()
+        cost = self._settled_cost()
+        mean = store.disps.mean(dim=(1, 2), keepdim=True)
+        t = store.T_cw[:, :3]
+        turn = torch.zeros_like(store.T_cw[:, :6])
+        middle = mean[:, 0, 0].mean()
+        turn[:, 3] = -2.0 * middle * t[:, 1]
+        turn[:, 4] = 2.0 * middle * t[:, 0]
+        mirrored = mul(exp(turn), store.T_cw)
+        mirrored[:, :3] = -t * t.new_tensor([1.0, 1.0, 0.0])
+        store.write(mirrored, (2.0 * mean - store.disps).clamp_min(0.1 * mean))
+        self._updates("init_blind", first_free=1, informed=False)
+        if not self._settled_cost() < cost:
+            store.write(*found)
+
+    def _settled_cost(self) -> float:
+        """Energy at the present poses and depths, without the say of uncertainty."""
+        before = self.store.T_cw.clone(), self.store.disps.clone()
+        phase = replace(self.config.schedule["init_blind"], iterations=1, learn=False, weigh=False)
+        rows = self.graph.select()
+        self.optimiser.adjust(self.graph, rows, phase, self.config.solver, first_free=1)
+        self.store.write(*before)
+        return self.optimiser.cost
 
     def _updates(self, phase: str, first_free: int, informed: bool = True) -> None:
         row = self.config.schedule[phase]

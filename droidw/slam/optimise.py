@@ -60,6 +60,7 @@ class Optimiser:
         self.clock = clock
         self.iterations = 0
         self.reports: dict[str, int] = {}
+        self.cost = float("nan")
 
     def measure(
         self, graph: FactorGraph, session: EdgeSession, rows: list[int], informed: bool
@@ -185,6 +186,7 @@ class Optimiser:
         )
         step = self.parts.ba.step(problem)
         self._note(step.report)
+        self.cost = step.report.cost_before
         store.T_cw[low:] = step.T_cw
         store.disps[low:] = step.disps
 

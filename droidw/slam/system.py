@@ -277,7 +277,9 @@ class SlamSystem:
         store, cloud = self.store, self.config.cloud
         if len(store) == 0:
             return (), static_cloud(store, torch.zeros(0), torch.zeros(0), cloud)
-        valid = consistent_depth(store, cloud.relative_threshold, cloud.min_views)
+        valid = consistent_depth(
+            store, cloud.relative_threshold, cloud.min_views, self.config.weighting.min_disp
+        )
         weight = self.optimiser.gates()
         T_wc = inv(store.T_cw.double()).cpu().numpy()
         intrinsics = store.image_intrinsics.double().cpu().numpy()

@@ -103,6 +103,8 @@ class FlowCorrespondence:
 
     def motion(self, reference: FlowFrame, current: FlowFrame) -> Motion:
         """Flow from the reference, judged by brightness agreement only."""
+        if not (current.texture.max(axis=-1) > 0.5 * self.options.texture).any():
+            return Motion(0.0, 0.0)  # a blank picture agrees with whatever is as bright
         flow = self._forward(reference, current)
         moved, agrees = self._one_way(reference, current, flow)
         return self._motion(moved, agrees, reference)
