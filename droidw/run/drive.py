@@ -33,7 +33,7 @@ from droidw.io.prefetch import prefetch
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
 from droidw.run.cameras import choose_camera
-from droidw.run.folder import FILES, prepare, write_json, write_text
+from droidw.run.folder import FILES, prepare, withdraw, write_json, write_text
 from droidw.run.manifest import REPORTS, facts_of_setup, facts_of_time, facts_of_tracking
 from droidw.run.signals import Stop
 from droidw.slam.frame import RunResult
@@ -77,8 +77,10 @@ def run(
         Interrupted: stopped by a signal, after what was tracked had been written.
     """
     device = _device(resolved)
-    prepare(run_dir, overwrite)
+    fresh = prepare(run_dir, overwrite)
     with ExitStack() as stack:
+        # What is refused before anything was tracked leaves no folder that would be in the way.
+        stack.callback(withdraw, run_dir, fresh)
         stack.enter_context(log_to_file(run_dir / "log.txt"))
         write_text(run_dir / "config.yaml", resolved.to_yaml())
         if note:

@@ -11,7 +11,7 @@ from typing import Any
 from droidw.errors import UsageError
 from droidw.io.files import atomic_write
 
-__all__ = ["FILES", "prepare", "write_json", "write_text"]
+__all__ = ["FILES", "prepare", "withdraw", "write_json", "write_text"]
 
 FILES: Mapping[str, str] = {
     "trajectory.tum": "pose of every input frame: t tx ty tz qx qy qz qw, camera to world",
@@ -28,14 +28,17 @@ FILES: Mapping[str, str] = {
 """What a run leaves, by name within the run folder."""
 
 
-def prepare(run_dir: Path, overwrite: bool) -> None:
+def prepare(run_dir: Path, overwrite: bool) -> bool:
     """Make the folder, or clear it of an earlier run.
 
     Only files of an earlier run are ever deleted, and only with `overwrite`.
 
+    Returns:
+        Whether the folder was not there before.
     Raises:
         UsageError: the folder holds something, or cannot be written.
     """
+    fresh = not run_dir.exists()
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         held = sorted(entry.name for entry in run_dir.iterdir())
@@ -55,7 +58,7 @@ def prepare(run_dir: Path, overwrite: bool) -> None:
             "give a folder that you may write to: -o FOLDER",
         )
     if not held:
-        return
+        return fresh
     shown = ", ".join(held[:4]) + (", ..." if len(held) > 4 else "")
     if not overwrite:
         raise UsageError(
@@ -69,6 +72,21 @@ def prepare(run_dir: Path, overwrite: bool) -> None:
         )
     for name in FILES:
         _clear(run_dir / name)
+    return fresh
+
+
+def withdraw(run_dir: Path, fresh: bool) -> None:
+    """Take back the folder of a run that ended before it had anything to keep.
+
+    Args:
+        run_dir: as prepared. fresh: what `prepare` said.
+    """
+    held = {entry.name for entry in run_dir.iterdir()}
+    if held <= {"config.yaml", "log.txt"}:
+        for name in held:
+            (run_dir / name).unlink()
+        if fresh:
+            run_dir.rmdir()
 
 
 def _clear(path: Path) -> None:

@@ -159,3 +159,12 @@ def test_a_part_that_breaks_while_tracking_keeps_what_was_tracked(go, footage, p
     assert "tracking stopped after" in ran.warnings
     assert 5 < len(ran.poses) < 26
     assert len(ran.poses) == ran.manifest["frames"]
+
+
+def test_a_refused_input_leaves_no_folder_in_the_way(tmp_path):
+    from droidw.cli.main import main
+
+    out = tmp_path / "out"
+    for _ in range(2):
+        assert main(["run", str(tmp_path / "nowhere.mp4"), "-o", str(out)]) == 3
+        assert not out.exists()
