@@ -11,6 +11,9 @@ from droidw_plugins.observers._html import escape
 
 __all__ = ["Line", "error_chart", "nice_step", "path_view"]
 
+# Mean width of a character of a note, in units of the drawing.
+_CHARACTER = 6.5
+
 Array = npt.NDArray[np.float64]
 _MOST = 1200
 
@@ -95,9 +98,12 @@ def path_view(
         )
     length = bar[0] * per_unit
     y = height - 14
+    # Beside the bar, or above it where the name of the axis would be in the way.
+    beside = length + _CHARACTER * len(bar[1]) < 0.55 * width
+    label = (margin + length + 10, y + 4) if beside else (margin, y - 10)
     parts += [
         f'<path class="bar" d="M{margin} {y - 4}v8M{margin} {y}h{length:.2f}m0 -4v8"/>',
-        f'<text class="note" x="{margin + length + 10:.1f}" y="{y + 4}">{escape(bar[1])}</text>',
+        f'<text class="note" x="{label[0]:.1f}" y="{label[1]:.1f}">{escape(bar[1])}</text>',
         f'<text class="note end-text" x="{width - 10}" y="{y + 4}">{escape(axes[0])} →</text>',
         f'<text class="note" x="10" y="18">↑ {escape(axes[1])}</text>',
         "</svg>",
