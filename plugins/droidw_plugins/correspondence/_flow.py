@@ -29,7 +29,7 @@ _FULL_FIELDS = 24
 # Grid flows kept for the filler: some ten kilobytes each.
 _GRID_FIELDS = 20_000
 # Median distance of two starts, in cells, that lead to the same result.
-_SAME_START = 0.15
+_SAME_START = 0.03
 # Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
 _FLAT = 0.1
 # Checked pairs kept for the next session that asks for them: some forty kilobytes each.
