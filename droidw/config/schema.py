@@ -89,7 +89,7 @@ class SolverConfig:
 
     lm: float = opt(1e-4, "relative damping of the reduced system", ge=0)
     ep: float = opt(0.1, "absolute damping of the reduced system", ge=0)
-    huber: float = opt(0.3, "Huber threshold in grid cells (0: quadratic)", ge=0)
+    huber: float = opt(0.2, "Huber threshold in grid cells (0: quadratic)", ge=0)
     guard: bool = opt(False, "shorten or reject a step that raises the energy")
 
 
@@ -129,7 +129,7 @@ class FrontendConfig:
 class BackendConfig:
     """Global bundle adjustment after tracking."""
 
-    passes: list[int] = opt([2, 2, 2, 2], "update steps of each global pass")
+    passes: list[int] = opt([2, 2, 2], "update steps of each global pass")
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)
@@ -222,7 +222,7 @@ class DroidwConfig:
         },
     )
     solver: SolverConfig = field(default_factory=SolverConfig)
-    global_solver: SolverConfig = field(default_factory=lambda: SolverConfig(lm=1e-8, ep=1e-6))
+    global_solver: SolverConfig = field(default_factory=lambda: SolverConfig(lm=1e-6, ep=1e-4))
     filler_solver: SolverConfig = field(default_factory=SolverConfig)
 
     device: str = opt("auto", "auto, cpu, cuda, cuda:N")
