@@ -105,8 +105,7 @@ class FlowCorrespondence:
         """Flow from the reference, judged by brightness agreement only."""
         if not (current.texture.max(axis=-1) > 0.5 * self.options.texture).any():
             return Motion(0.0, 0.0)  # a blank picture agrees with whatever is as bright
-        flow = self._forward(reference, current)
-        moved, agrees = self._one_way(reference, current, flow)
+        moved, agrees = self._one_way(reference, current, self._forward)
         return self._motion(moved, agrees, reference)
 
     def session(self, purpose: Purpose = "window") -> _FlowSession:
@@ -160,14 +159,16 @@ class FlowCorrespondence:
                 self._full.popitem(last=False)
         return flow
 
-    def _one_way(self, a: FlowFrame, b: FlowFrame, flow: Array) -> tuple[Array, Array]:
+    def _one_way(
+        self, a: FlowFrame, b: FlowFrame, search: Callable[[FlowFrame, FlowFrame], Array]
+    ) -> tuple[Array, Array]:
         """Displacement [h,w,2] px at the cells and brightness agreement [h,w] in [0,1]."""
         key = (a.index, b.index)
         with self._lock:
             known = self._grid.get(key)
         if known is not None:
             return known
-        moved = _at(flow, a.centres)
+        moved = _at(search(a, b), a.centres)
         agrees = self._agreement(a, b, moved)
         with self._lock:
             self._grid[key] = (moved, agrees)
@@ -194,12 +195,7 @@ class FlowCorrespondence:
 
     def one_way(self, a: FlowFrame, b: FlowFrame) -> _Edge:
         """Edge a -> b without the way back."""
-        key = (a.index, b.index)
-        with self._lock:
-            known = self._grid.get(key)
-        if known is None:
-            known = self._one_way(a, b, self._search(a, b))
-        moved, agrees = known
+        moved, agrees = self._one_way(a, b, self._search)
         confidence = agrees[..., None] * self._texture_weight(a)
         target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
         return _Edge(target, confidence, None)
