@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from droidw.cli.options import add_plugin_arguments, plugins_from
 from droidw.errors import UsageError
 from droidw.plugin.registry import KINDS, Entry, PluginNotFound, nearest
+from droidw.plugin.weights import weights_name
 
 if TYPE_CHECKING:
     from droidw.plugin.manager import Plugins
@@ -195,7 +196,7 @@ def _facts(plugins: Plugins, entry: Entry) -> dict[str, Any]:
         "version": entry.version,
         "requires": list(component.requires),
         "extra": component.extra,
-        "weights": list(component.weights),
+        "weights": [weights_name(w) for w in component.weights_for()],
         "capabilities": sorted(component.capabilities),
         "reference": component.reference,
         "options_key": _key(entry),

@@ -17,6 +17,7 @@ import pluggy
 from droidw.errors import PluginError
 from droidw.plugin.component import Component
 from droidw.plugin.registry import KINDS, nearest
+from droidw.plugin.weights import WeightsFile
 
 __all__ = ["HOOKS", "checked_components", "explained", "import_file", "problem_of"]
 
@@ -63,10 +64,23 @@ def problem_of(item: object) -> str:
         missing = dataclasses.MISSING
         if entry.default is missing and entry.default_factory is missing:
             return f"'{record.name}': option '{entry.name}' has no default"
-    for attribute in ("requires", "weights", "capabilities"):
+    for attribute in ("requires", "capabilities"):
         value = getattr(record, attribute)
         if isinstance(value, str) or not all(isinstance(part, str) for part in value):
             return f"'{record.name}': {attribute} is {value!r}, not a collection of strings"
+    return _problem_of_weights(record)
+
+
+def _problem_of_weights(record: Any) -> str:
+    try:
+        wanted = record.weights if isinstance(record.weights, str) else record.weights_for()
+    except Exception as error:  # noqa: BLE001 - strangers' code
+        return f"'{record.name}': weights raised {type(error).__name__}: {error}"
+    if isinstance(wanted, str) or not all(isinstance(w, (str, WeightsFile)) for w in wanted):
+        return (
+            f"'{record.name}': weights is {wanted!r}, not a collection of names or of "
+            "droidw.WeightsFile records"
+        )
     return ""
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from droidw.plugin.weights import WeightsFile
 
 if TYPE_CHECKING:
     import torch
@@ -53,7 +55,9 @@ class Component(Generic[T]):
             text for `list-plugins --options` comes from `field(metadata={"help": ...})`.
         requires: import names that must be importable, checked without importing them.
         extra: the extra that installs what `requires` names, e.g. "open3d".
-        weights: names of weights files that must be on disk (`droidw weights list`).
+        weights: files that must be on disk (`droidw weights list`): records, or bare names of
+            what another part describes; or, where it depends on the options, a function of them
+            that returns such a tuple (`weights_for` asks).
         capabilities: facts that the host checks before a run: "cpu", "cuda" (devices it runs
             on), "features" (an uncertainty model that needs features, an extractor that gives
             them), "depth" (a depth prior that gives depth).
@@ -68,7 +72,13 @@ class Component(Generic[T]):
     options: type = NoOptions
     requires: tuple[str, ...] = ()
     extra: str | None = None
-    weights: tuple[str, ...] = ()
+    weights: tuple[str | WeightsFile, ...] | Callable[[Any], Sequence[str | WeightsFile]] = ()
     capabilities: frozenset[str] = frozenset({"cpu"})
     reference: str = ""
     available: Callable[[], str] | None = field(default=None, compare=False)
+
+    def weights_for(self, options: Any = None) -> tuple[str | WeightsFile, ...]:
+        """The weights that the part needs with these options (an instance; None: the defaults)."""
+        if not callable(self.weights):
+            return tuple(self.weights)
+        return tuple(self.weights(self.options() if options is None else options))

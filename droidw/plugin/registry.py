@@ -11,6 +11,7 @@ from typing import Any
 
 from droidw.errors import ConfigError, MissingRequirementError, PluginError
 from droidw.plugin.component import Component
+from droidw.plugin.weights import find_weights, weights_name
 
 __all__ = ["KINDS", "SLOTS", "Entry", "Failure", "Kind", "PluginNotFound", "Registry", "nearest"]
 
@@ -173,10 +174,10 @@ class Registry:
         """The component of that name; raises as `entry` does."""
         return self.entry(name).component
 
-    def status(self, name: str) -> str:
-        """Say "ready", or in a few words why the part cannot be used.
+    def status(self, name: str, options: Any = None) -> str:
+        """Say "ready", or in a few words why the part cannot be used with these options.
 
-        Examples: "needs droidw[open3d]", "weights missing: droid.pth", "no GPU visible".
+        Examples: "needs droidw[open3d]", "weights missing: droid", "no GPU visible".
 
         Raises:
             PluginNotFound: nobody offers it.
@@ -195,13 +196,13 @@ class Registry:
             if component.extra and entry.version:
                 return f"needs {entry.distribution}[{component.extra}]"
             return "needs " + ", ".join(packages)
-        weights = self._missing_weights(component)
+        weights = self._missing_weights(component, options)
         if weights:
             return "weights missing: " + ", ".join(weights)
         return _unavailable(component) or "ready"
 
-    def require(self, name: str) -> Component[Any]:
-        """The component of that name, which can be used here.
+    def require(self, name: str, options: Any = None) -> Component[Any]:
+        """The component of that name, which can be used here with these options.
 
         Raises:
             MissingRequirementError: a package, an extra, weights or a device is missing; says
@@ -222,13 +223,15 @@ class Registry:
                 f"'{name}' is registered but cannot run: Python {verb.format(listed)} missing",
                 f"install it: pip install {what}" + self._instead(name),
             )
-        weights = self._missing_weights(component)
+        weights = self._missing_weights(component, options)
         if weights:
             raise MissingRequirementError(
                 f"'{name}' is registered but cannot run: its weights "
                 + ", ".join(f"'{w}'" for w in weights)
                 + f" are not in {self.weights_dir or 'any folder: none is set'}",
-                "put them there, or name their folder: DROIDW_WEIGHTS=FOLDER" + self._instead(name),
+                "".join(f"download them: droidw weights fetch {w}\n" for w in weights)
+                + "or add a file that is on disk: droidw weights add FILE\n"
+                "or name the folder that has them: DROIDW_WEIGHTS=FOLDER" + self._instead(name),
             )
         reason = _unavailable(component)
         if reason:
@@ -238,9 +241,9 @@ class Registry:
             )
         return component
 
-    def _missing_weights(self, component: Component[Any]) -> list[str]:
-        folder = self.weights_dir
-        return [w for w in component.weights if folder is None or not (folder / w).is_file()]
+    def _missing_weights(self, component: Component[Any], options: Any) -> list[str]:
+        wanted = component.weights_for(options)
+        return [weights_name(w) for w in wanted if find_weights(self.weights_dir, w) is None]
 
     def _available(self) -> str:
         return ", ".join(n for n in self.names() if n not in self.blocked) or "none are registered"

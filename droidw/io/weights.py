@@ -1,0 +1,137 @@
+"""Trained weights on disk: finding them and reading their tensors."""
+
+from __future__ import annotations
+
+import pickle
+import re
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from droidw.errors import InputError, MissingRequirementError
+from droidw.plugin.weights import WeightsFile, find_weights, weights_name
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+__all__ = ["find", "load_state", "looks_like_html", "read_state"]
+
+_WRAPPERS = ("state_dict", "model", "model_state_dict")
+
+
+def find(folder: Path | None, name: str | WeightsFile) -> Path | None:
+    """The weights file on disk, or None; see `droidw.plugin.weights.find_weights`."""
+    return find_weights(folder, name)
+
+
+def load_state(folder: Path | None, name: str | WeightsFile) -> dict[str, Tensor]:
+    """The tensors of a weights file by key, on the CPU, as they are stored.
+
+    Args:
+        folder: the folder of weights (`BuildContext.weights_dir`).
+        name: name without ending ("droid"), or the record, which also knows the published name.
+    Raises:
+        MissingRequirementError: it is not there; says what to type.
+        InputError: as `read_state`.
+    """
+    path = find(folder, name)
+    if path is None:
+        stem = weights_name(name)
+        raise MissingRequirementError(
+            f"the weights '{stem}' are not in {folder or 'any folder: none is set'}",
+            f"download them: droidw weights fetch {stem}\n"
+            "or, where they are on disk already: droidw weights add FILE",
+        )
+    return read_state(path)
+
+
+def read_state(path: Path) -> dict[str, Tensor]:
+    """The tensors of a .safetensors file or of a torch checkpoint by key, on the CPU.
+
+    A checkpoint may hold them under "state_dict", "model" or "model_state_dict". Pickles are
+    read with `weights_only`, so that no code in them runs.
+
+    Raises:
+        InputError: it cannot be read, is cut short, is no checkpoint, or holds more than tensors.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(512)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if looks_like_html(head):
+        raise InputError(
+            f"{path} is a web page, not weights: a site answered with a page instead of the file",
+            "remove it and fetch it again: droidw weights fetch NAME (names: droidw weights list)",
+        )
+    # Eight bytes of length, then JSON: the ending of the name may be wrong.
+    is_safetensors = head[8:9] == b"{" or path.suffix == ".safetensors"
+    return _tensors(path, _read_safetensors(path) if is_safetensors else _read_torch(path))
+
+
+def looks_like_html(head: bytes) -> bool:
+    """Whether the first bytes of a file are those of a web page."""
+    start = head.lstrip(b"\xef\xbb\xbf \t\r\n")[:200].lower()
+    return start.startswith((b"<!doctype html", b"<html", b"<head", b"<?xml")) or (
+        start.startswith(b"<!--") and b"<html" in head.lower()
+    )
+
+
+def _read_safetensors(path: Path) -> object:
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise _broken(path, error) from error
+
+
+def _read_torch(path: Path) -> object:
+    import torch
+
+    try:
+        # Mapped into memory: what stands beside the weights (states of an optimiser) costs none.
+        return torch.load(
+            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
+        )
+    except pickle.UnpicklingError as error:
+        if "Unsupported" in str(error) or "GLOBAL" in str(error):
+            raise InputError(
+                f"{path} is refused: it holds more than tensors, and reading it could run code",
+                "get the file from its authors again: droidw weights list",
+            ) from error
+        raise _broken(path, error) from error
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise _broken(path, error) from error
+
+
+def _broken(path: Path, error: Exception) -> InputError:
+    said = re.split(r"\. |\n", str(error).strip())[0] or type(error).__name__
+    return InputError(
+        f"{path} cannot be read as weights: it is cut short, damaged or something else ({said})",
+        "remove it and fetch it again: droidw weights fetch NAME (names: droidw weights list)",
+    )
+
+
+def _tensors(path: Path, loaded: object) -> dict[str, Tensor]:
+    import torch
+
+    while isinstance(loaded, Mapping):
+        inner = [loaded[key] for key in _WRAPPERS if isinstance(loaded.get(key), Mapping)]
+        if not inner:
+            break
+        loaded = inner[0]
+    if not isinstance(loaded, Mapping) or not loaded:
+        raise InputError(
+            f"{path} holds no tensors by name, but {type(loaded).__name__}",
+            "weights are a state dict, as torch.save(network.state_dict(), FILE) writes it",
+        )
+    for key, value in loaded.items():
+        if not isinstance(value, torch.Tensor):
+            raise InputError(
+                f"{path}: '{key}' is no tensor but {type(value).__name__}",
+                "weights are a state dict, as torch.save(network.state_dict(), FILE) writes it",
+            )
+    return {str(key): value for key, value in loaded.items()}
