@@ -23,7 +23,7 @@ class WeightsFile:
         name: lower-case kebab, unique among all files, e.g. "acme-small"; what
             `droidw weights fetch` takes and the stem of the file on disk.
         urls: where it is published, tried in this order; http, https or Google Drive.
-        size: bytes as published, 0 where unknown.
+        size: bytes, about, for the listing; 0 where unknown.
         licence: of the weights, e.g. "CC BY-NC 4.0"; "not stated" where it is not.
         sha256: of the published file in lower-case hex, "" where its authors give none.
         file: name under which it is published ("acme_small_v2.pth"), also found by that name.
