@@ -34,7 +34,7 @@ FIT3D = WeightsFile(
     size=88_200_000,
     licence="MIT (code); weights: nothing separate stated, fine-tuned from DINOv2 (Apache-2.0)",
     file="dinov2_reg_small_finetuned.pth",
-    check="droidw_plugins._weights_check:fit3d",
+    check="droidw_plugins._vit.published:check_fit3d",
     reference="Yue et al., FiT3D, ECCV 2024; github.com/ywyue/FiT3D",
 )
 
@@ -44,7 +44,7 @@ FIT3D_PLAIN = WeightsFile(
     size=88_200_000,
     licence="MIT (code); weights: nothing separate stated, fine-tuned from DINOv2 (Apache-2.0)",
     file="dinov2_small_finetuned.pth",
-    check="droidw_plugins._weights_check:fit3d_plain",
+    check="droidw_plugins._vit.published:check_fit3d_plain",
     reference="Yue et al., FiT3D, ECCV 2024; github.com/ywyue/FiT3D; without registers",
 )
 
@@ -54,7 +54,7 @@ DINOV2_VITS14 = WeightsFile(
     size=88_200_000,
     licence="Apache-2.0",
     file="dinov2_vits14_pretrain.pth",
-    check="droidw_plugins._weights_check:dinov2_vits14",
+    check="droidw_plugins._vit.published:check_dinov2_vits14",
     reference="Oquab et al., DINOv2, TMLR 2024; github.com/facebookresearch/dinov2",
 )
 
@@ -64,7 +64,7 @@ DINOV2_VITS14_REG = WeightsFile(
     size=88_200_000,
     licence="Apache-2.0",
     file="dinov2_vits14_reg4_pretrain.pth",
-    check="droidw_plugins._weights_check:dinov2_vits14_reg",
+    check="droidw_plugins._vit.published:check_dinov2_vits14_reg",
     reference="Darcet et al., Vision Transformers Need Registers, ICLR 2024; same repository",
 )
 
@@ -74,7 +74,7 @@ METRIC3D_VIT_SMALL = WeightsFile(
     size=150_000_000,
     licence="BSD-2-Clause (code); weights: nothing separate stated",
     file="metric_depth_vit_small_800k.pth",
-    check="droidw_plugins._weights_check:metric3d_vit_small",
+    check="droidw_plugins.depth._metric3d_net:check_vit_small",
     reference="Hu et al., Metric3D v2, TPAMI 2024; github.com/YvanYin/Metric3D",
 )
 
@@ -84,6 +84,6 @@ METRIC3D_VIT_LARGE = WeightsFile(
     size=1_648_000_000,
     licence="BSD-2-Clause (code); weights: nothing separate stated",
     file="metric_depth_vit_large_800k.pth",
-    check="droidw_plugins._weights_check:metric3d_vit_large",
+    check="droidw_plugins.depth._metric3d_net:check_vit_large",
     reference="Hu et al., Metric3D v2, TPAMI 2024; github.com/YvanYin/Metric3D",
 )

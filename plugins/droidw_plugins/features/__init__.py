@@ -17,7 +17,9 @@ __all__ = ["droidw_feature_extractors"]
 @hookimpl
 def droidw_feature_extractors() -> Iterable[Component[FeatureExtractor]]:
     """Light records only: the factory of each imports what it needs."""
-    from droidw_plugins.features import cnn, none
+    from droidw_plugins.features import cnn, dinov2, fit3d, none
 
     yield cnn.COMPONENT
+    yield dinov2.COMPONENT
+    yield fit3d.COMPONENT
     yield none.COMPONENT
