@@ -45,6 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--stride", metavar="N", help="keep every n-th picture")
     parser.add_argument("--skip", metavar="N", help="leave out the first n pictures")
     parser.add_argument("--max-frames", metavar="N", help="stop after n pictures")
+    parser.add_argument(
+        "--masks",
+        metavar="DIR",
+        help="folder with a mask per picture, of the same name or in the same order: what is not "
+        "black there is ignored",
+    )
     parser.add_argument("--device", metavar="D", help="auto, cpu, cuda, cuda:N")
     parser.add_argument("--seed", metavar="N", help="seed of everything that draws numbers")
     add_plugin_arguments(parser)
@@ -72,6 +78,8 @@ def main(args: argparse.Namespace) -> int:
     values = {} if source is None else {"input.source": source}
     if args.calib is not None:
         values["camera.calib"] = args.calib
+    if args.masks is not None:
+        values["input.masks"] = args.masks
     flags = [
         f"{key}={getattr(args, flag)}"
         for flag, key in _FLAGS.items()

@@ -51,6 +51,7 @@ class InputConfig:
     stride: int = opt(1, "keep every n-th picture", ge=1)
     skip: int = opt(0, "leave out the first n pictures", ge=0)
     max_frames: int = opt(0, "stop after n pictures (0: all)", ge=0)
+    masks: str = opt("", "folder with a mask per picture: what is not black there is ignored")
 
 
 @dataclass

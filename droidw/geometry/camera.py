@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from droidw.errors import InputError
 from droidw.slam.frame import Frame, RawFrame  # records only: imports nothing at run time
@@ -218,6 +219,20 @@ class Grid:
         )
         return torch.lerp(top, low, part)
 
+    def covered(self, mask: Tensor) -> Tensor:
+        """Share [h,w] in [0,1] of each cell's `stride` x `stride` pixels that a mask marks.
+
+        Args:
+            mask: [H,W] bool at the size of the picture; its border goes on beyond its edges.
+        """
+        # The first pixel of the first cell, which may lie outside.
+        start = math.ceil(self.offset - (self.stride - 1) / 2 - 0.5)
+        first = max(-start, 0)
+        border = (first, self.stride, first, self.stride)
+        padded = F.pad(mask[None, None].float(), border, mode="replicate")
+        shares = F.avg_pool2d(padded[..., start + first :, start + first :], self.stride)
+        return shares[0, 0, : self.height, : self.width].contiguous()
+
     def _pick(self, maps: Tensor, top: int, left: int) -> Tensor:
         rows = slice(top, top + (self.height - 1) * self.stride + 1, self.stride)
         columns = slice(left, left + (self.width - 1) * self.stride + 1, self.stride)
@@ -321,16 +336,53 @@ class Rectifier:
             shrinks = self._resized[0] <= width and self._resized[1] <= height
             mode = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
             out = cv2.resize(out, self._resized, interpolation=mode).astype(np.uint8, copy=False)
-        out = out[
-            self._top : self._top + self.camera.height, self._left : self._left + self.camera.width
-        ]
-        return np.ascontiguousarray(out)
+        return np.ascontiguousarray(self._crop(out))
 
-    def __call__(self, raw: RawFrame) -> Frame:
-        """The frame at working size, image [3,H,W] float32 in [0,1]; errors of `rectify_image`."""
+    def _crop(self, picture: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+        bottom, right = self._top + self.camera.height, self._left + self.camera.width
+        return picture[self._top : bottom, self._left : right]
+
+    def rectify_mask(self, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+        """The mask [h,w] bool that lies on the working picture, from one of any size.
+
+        A mask of the working size is taken as it is; any other is enlarged or reduced to the raw
+        picture without blending, and then goes the way of the picture.
+
+        Raises:
+            InputError: the mask has another shape (ratio of its sides) than the picture.
+        """
+        height, width = mask.shape
+        if (width, height) == (self.camera.width, self.camera.height):
+            return np.array(mask, dtype=bool)
+        stretch = (width / height) / (self.raw.width / self.raw.height)
+        if not 0.98 < stretch < 1.02:
+            raise InputError(
+                f"a mask of {width}x{height} pixels does not fit pictures of "
+                f"{self.raw.width}x{self.raw.height} pixels",
+                "masks may be of any size, but must show the whole picture",
+            )
+        out = np.ascontiguousarray(mask, dtype=np.uint8)
+        if self._maps is not None:
+            out = _nearest(out, (self.raw.width, self.raw.height))
+            # Fixed-point maps know no nearest neighbour; what is more than half masked counts.
+            out = np.asarray(cv2.remap(out * 255, *self._maps, cv2.INTER_LINEAR) > 127, np.uint8)
+        return np.array(self._crop(_nearest(out, self._resized)), dtype=bool)
+
+    def __call__(self, raw: RawFrame, mask: npt.NDArray[np.bool_] | None = None) -> Frame:
+        """The frame at working size, image [3,H,W] float32 in [0,1], with its mask, if any.
+
+        Raises:
+            InputError: as `rectify_image` and `rectify_mask`.
+        """
         image = torch.from_numpy(self.rectify_image(raw.image))
         planes = image.permute(2, 0, 1).to(torch.float32).div_(255.0).contiguous()
-        return Frame(raw.index, raw.time, planes, self.camera.intrinsics(), raw.name)
+        ignored = None if mask is None else torch.from_numpy(self.rectify_mask(mask))
+        return Frame(raw.index, raw.time, planes, self.camera.intrinsics(), raw.name, ignored)
+
+
+def _nearest(mask: npt.NDArray[np.uint8], size: tuple[int, int]) -> npt.NDArray[np.uint8]:
+    """A mask resized without blending, the pixel that lies under the centre of the new one."""
+    return np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST_EXACT), np.uint8)
 
 
 def _undistortion_maps(

@@ -1,4 +1,4 @@
-"""Which camera a run assumes, and why."""
+"""Which camera a run assumes, and why; and the masks that go with its pictures."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 from droidw.errors import InputError
 from droidw.geometry.camera import Camera
 from droidw.io.calib import read_calibration
+from droidw.io.masks import UserMasks
 
 if TYPE_CHECKING:
-    from droidw.config.schema import CameraConfig
+    from droidw.config.schema import CameraConfig, InputConfig
+    from droidw.interfaces.datasets import FrameSource
 
-__all__ = ["GUESSED_FOV", "choose_camera"]
+__all__ = ["GUESSED_FOV", "choose_camera", "open_masks"]
 
 GUESSED_FOV = 60.0
 """Horizontal field of view in degrees where nothing is known: between phones and webcams."""
@@ -78,3 +80,20 @@ def _scaled(camera: Camera, width: int, height: int, source: str) -> Camera:
             f"calibrate at {width}x{height}, or give --focal PIXELS or --fov DEGREES",
         )
     return camera.resized(width, height).validated(source)
+
+
+def open_masks(config: InputConfig, source: FrameSource) -> UserMasks | None:
+    """The masks that the configuration names, or None.
+
+    Raises:
+        InputError: the folder is not there or holds no masks.
+    """
+    if not config.masks:
+        return None
+    if source.length is None:
+        return UserMasks(Path(config.masks), 0, None)
+    # A selection hides how many pictures there are, but for a range.
+    least = config.skip + (source.length - 1) * config.stride + 1
+    return UserMasks(
+        Path(config.masks), least, None if config.max_frames else least + config.stride - 1
+    )

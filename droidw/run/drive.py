@@ -32,7 +32,7 @@ from droidw.interfaces.datasets import Selection
 from droidw.io.prefetch import prefetch
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
-from droidw.run.cameras import choose_camera
+from droidw.run.cameras import choose_camera, open_masks
 from droidw.run.folder import FILES, prepare, withdraw, write_json, write_text
 from droidw.run.manifest import REPORTS, facts_of_setup, facts_of_time, facts_of_tracking
 from droidw.run.signals import Stop
@@ -148,6 +148,7 @@ class _Run:
         )
         if guessed:
             self.events.warn(f"camera: {self.said}")
+        self.masks = open_masks(self.config.input, source)
         parts = self._build()
         threads = "threads" in self.resolved.parts["correspondence"][0].capabilities
         system = SlamSystem(
@@ -173,19 +174,21 @@ class _Run:
         self._conclude(failure, result, outcome)
         return result
 
-    @staticmethod
     def _prepared(
-        pictures: Iterable[RawFrame], rectify: Rectifier, clock: Stopwatch
+        self, pictures: Iterable[RawFrame], rectify: Rectifier, clock: Stopwatch
     ) -> Iterator[Frame]:
         """Frames at working size; what decoding takes is counted in the thread that decodes."""
         pending = iter(pictures)
         while True:
             with clock("decode"):
                 raw = next(pending, None)
-                frame = None if raw is None else rectify(raw)
+                frame = None if raw is None else rectify(raw, self._mask(raw))
             if frame is None:
                 return
             yield frame
+
+    def _mask(self, raw: RawFrame) -> Any:
+        return self.masks.of(raw) if self.masks is not None else None
 
     def _track(
         self, system: SlamSystem, frames: Callable[[], Generator[Frame, None, None]]
@@ -273,7 +276,7 @@ class _Run:
         self, system: SlamSystem, source: FrameSource, outcome: Outcome, rectify: Rectifier
     ) -> RunResult:
         warnings = self.events
-        for text in outcome.diagnosis.warnings():
+        for text in (*outcome.diagnosis.warnings(), *(self.masks.problems() if self.masks else ())):
             warnings.warn(text)
         for status, count in system.optimiser.reports.items():
             warnings.warn(REPORTS.get(status, "{count} steps: " + status).format(count=count))

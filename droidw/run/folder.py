@@ -23,6 +23,7 @@ FILES: Mapping[str, str] = {
     "manifest.json": "versions, parts, timings, what was assumed about the camera",
     "log.txt": "what was logged",
     "uncertainty": "uncertainty per keyframe (16-bit PNG) and as an overlay video",
+    "masks": "what moves, per keyframe: black and white PNG",
     "depth": "depth per keyframe (16-bit PNG and NPZ)",
 }
 """What a run leaves, by name within the run folder."""

@@ -33,7 +33,7 @@ class Filler:
         store = optimiser.store
         self._times = store.times()
         self._rows = {info.index: row for row, info in enumerate(store.infos)}
-        self._gates = optimiser.gates()
+        self._gates = optimiser.gates(learned=config.schedule["fill"].weigh)
 
     def is_keyframe(self, index: int) -> bool:
         """Whether frame `index` is a keyframe and needs no filling."""
@@ -108,7 +108,7 @@ class Filler:
             weight = residual_weights(
                 answer.confidence,
                 None,
-                gates if phase.weigh else None,
+                gates,
                 ii,
                 jj,
                 answer.target,

@@ -44,6 +44,7 @@ class Frame:
         image: [3,H,W] float32 in [0,1], RGB.
         intrinsics: [4] float32 fx, fy, cx, cy in pixels of `image`; pixel centres at integers.
         name: label of the raw frame.
+        mask: [H,W] bool, True where the user wants the picture ignored; None: nowhere.
     """
 
     index: int
@@ -51,6 +52,7 @@ class Frame:
     image: Tensor
     intrinsics: Tensor
     name: str = ""
+    mask: Tensor | None = None
 
 
 @dataclass(frozen=True)

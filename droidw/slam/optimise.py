@@ -152,7 +152,7 @@ class Optimiser:
         """One Gauss-Newton step on the part of the store that the edges touch."""
         store, weighting = self.store, self.weighting
         low = int(torch.minimum(ii.min(), jj.min()))
-        gates = self.gates(low) if phase.weigh else None
+        gates = self.gates(low, learned=phase.weigh)
         weight = residual_weights(
             confidence,
             None,
@@ -196,11 +196,16 @@ class Optimiser:
         if report.dropped:
             self.reports["dropped"] = self.reports.get("dropped", 0) + report.dropped
 
-    def gates(self, first: int = 0) -> Tensor:
-        """Weights in [0,1] of all cells of the keyframes from `first` on, [N-first,h,w]."""
-        w = self.weighting
+    def gates(self, first: int = 0, learned: bool = True) -> Tensor:
+        """Weights in [0,1] of all cells of the keyframes from `first` on, [N-first,h,w].
+
+        What the user's masks leave, times what uncertainty leaves (if `learned`).
+        """
+        w, unmasked = self.weighting, self.store["unmasked"][first:]
+        if not learned:
+            return unmasked
         u = self.store["uncertainty"][first:]
-        return gate(u, kind=w.gate, slope=w.slope, shift=w.shift, floor=w.floor)
+        return unmasked * gate(u, kind=w.gate, slope=w.slope, shift=w.shift, floor=w.floor)
 
     def view(
         self,

@@ -169,12 +169,17 @@ class SlamSystem:
             prior = self._prior(frame)
         payload = parts.correspondence.context(current.payload, frame, self.grid)
         pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
+        if frame.mask is not None:
+            masked = {"unmasked": 1 - self.grid.covered(frame.mask.to(store.device))}
+        else:
+            masked = {}
         number = store.append(
             KeyframeInfo(frame.index, frame.time, frame.name, pixels.cpu().numpy(), payload),
             T_cw=pose,
             disps=disp,
             features=features,
             prior=prior,
+            **masked,
         )
         with self.clock("uncertainty"):
             parts.uncertainty.append(self.optimiser.view(), number)

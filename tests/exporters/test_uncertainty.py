@@ -13,6 +13,8 @@ import pytest
 from droidw.errors import DroidwError, MissingRequirementError, UsageError
 from droidw.eval.masks import read_uncertainty, score_folder
 from droidw.interfaces.exporters import Exporter
+from droidw.io.masks import UserMasks
+from droidw.slam.frame import RawFrame
 from droidw.testing._check_files import sample_result
 from droidw.testing.conformance import check_exporter
 from droidw_plugins.exporters import _movie, uncertainty
@@ -41,6 +43,10 @@ def result():
     return replace(full, keyframes=tuple(keyframes[::-1]), trajectory=trajectory)
 
 
+def exporter(**options):
+    return uncertainty.UncertaintyExporter(uncertainty.UncertaintyOptions(**options))
+
+
 def decoded(path):
     with av.open(str(path)) as container:
         (stream,) = container.streams
@@ -53,13 +59,17 @@ def test_conformance():
 
 
 def test_files_and_maps(result, tmp_path):
-    exporter = uncertainty.COMPONENT.factory(uncertainty.UncertaintyOptions(), None)
-    assert isinstance(exporter, Exporter)
-    written = exporter.export(result, tmp_path)
+    made = uncertainty.COMPONENT.factory(uncertainty.UncertaintyOptions(), None)
+    assert isinstance(made, Exporter)
+    written = made.export(result, tmp_path)
     folder = tmp_path / "uncertainty"
-    names = ["000000.png", "000002.png", "000004.png", "overlay.mp4", "scale.json"]
+    masks = ["000000.png", "000002.png", "000004.png", "scale.json"]
+    names = [*masks[:3], "overlay.mp4", "scale.json"]
     assert sorted(path.name for path in folder.iterdir()) == names
-    assert sorted(written) == [folder / name for name in names]
+    assert sorted(path.name for path in (tmp_path / "masks").iterdir()) == masks
+    assert sorted(written) == [
+        *(tmp_path / "masks" / name for name in masks), *(folder / name for name in names)
+    ]  # fmt: skip
     facts = json.loads((folder / "scale.json").read_text())
     assert (facts["scale"], facts["stride"], facts["offset"]) == (0.001, STRIDE, 3.5)
     for keyframe in result.keyframes:
@@ -70,7 +80,7 @@ def test_files_and_maps(result, tmp_path):
 
 
 def test_the_evaluation_reads_the_maps(result, tmp_path):
-    uncertainty.UncertaintyExporter(video=False).export(result, tmp_path)
+    exporter(video=False).export(result, tmp_path)
     masks = tmp_path / "mask"
     masks.mkdir()
     mask = np.zeros((H, W), np.uint8)
@@ -81,6 +91,29 @@ def test_the_evaluation_reads_the_maps(result, tmp_path):
     assert (score.frames, score.without_mask, score.auc, score.iou) == (3, 0, 1.0, 1.0)
 
 
+@pytest.mark.parametrize(("below", "edge"), [(0.5, 80), (1.0, 76), (0.25, 82)])
+def test_masks_are_where_weight_is_lost(result, tmp_path, below, edge):
+    """Cells 9 and 10 lie at 75.5 and 83.5, and the weight falls evenly between them."""
+    exporter(maps=False, video=False, mask_below=below).export(result, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["masks"]
+    for keyframe in result.keyframes:
+        mask = cv2.imread(str(tmp_path / "masks" / f"{keyframe.index:06d}.png"), -1)
+        assert mask.dtype == np.uint8 and mask.shape == (H, W)
+        assert (mask[:, :edge] == 0).all() and (mask[:, edge:] == 255).all()
+    facts = json.loads((tmp_path / "masks" / "scale.json").read_text())
+    assert facts["named"] == "index" and facts["picture"] == [W, H]
+
+
+def test_masks_come_back_as_masks_of_the_user(result, tmp_path):
+    exporter(maps=False, video=False).export(result, tmp_path)
+    masks = UserMasks(tmp_path / "masks", 5, 5)
+    # The pictures happen to be counted from 1, so that names would mislead.
+    pictures = [RawFrame(k, k / 30, np.zeros((1, 1, 3), np.uint8), f"{k + 1:06d}") for k in (0, 4)]
+    for picture in pictures:
+        found = masks.of(picture)
+        assert found.shape == (H, W) and found[:, 80:].all() and not found[:, :80].any()
+
+
 def test_values_that_do_not_fit():
     values = np.array([[-1, 0, 0.0005001, 65.5, 65.6], [1e30, np.inf, -np.inf, np.nan, 1]])
     read = uncertainty.encode(values.astype(np.float32))
@@ -88,10 +121,10 @@ def test_values_that_do_not_fit():
 
 
 def test_the_video_plays_at_the_times_of_the_keyframes(result, tmp_path):
-    uncertainty.UncertaintyExporter(maps=False).export(result, tmp_path)
+    exporter(maps=False, masks=False).export(result, tmp_path)
     assert [path.name for path in (tmp_path / "uncertainty").iterdir()] == ["overlay.mp4"]
     codec, duration, frames = decoded(tmp_path / "uncertainty" / "overlay.mp4")
-    assert codec in ("h264", "mpeg4")
+    assert codec == "vp9"
     assert [time for time, _ in frames] == pytest.approx([0, 0.1, 0.85], abs=0.002)
     # The gaps are 0.1 and 0.75 s, and the last picture stays for their median.
     assert duration == pytest.approx(0.85 + 0.425, abs=0.003)
@@ -110,7 +143,7 @@ def test_alpha_and_weights_that_are_no_numbers(result, tmp_path):
     blank = np.full((H // STRIDE, W // STRIDE), np.nan, np.float32)
     keyframes = (replace(result.keyframes[0], weight=blank), *result.keyframes[1:])
     bare = replace(result, keyframes=keyframes)
-    uncertainty.UncertaintyExporter(maps=False, alpha=0.0).export(bare, tmp_path)
+    exporter(maps=False, masks=False, alpha=0.0).export(bare, tmp_path)
     for _, picture in decoded(tmp_path / "uncertainty" / "overlay.mp4")[2]:
         np.testing.assert_allclose(picture[:90].mean((0, 1)), 120, atol=6)
     with pytest.raises(ValueError, match="between 0 and 1"):
@@ -118,8 +151,8 @@ def test_alpha_and_weights_that_are_no_numbers(result, tmp_path):
 
 
 def test_nothing_is_written_where_there_is_nothing(result, tmp_path):
-    assert uncertainty.UncertaintyExporter().export(replace(result, keyframes=()), tmp_path) == []
-    assert uncertainty.UncertaintyExporter(maps=False, video=False).export(result, tmp_path) == []
+    assert exporter().export(replace(result, keyframes=()), tmp_path) == []
+    assert exporter(maps=False, masks=False, video=False).export(result, tmp_path) == []
     assert list(tmp_path.iterdir()) == []
 
 
@@ -152,7 +185,7 @@ def test_every_encoder_there_is(tmp_path, codec, size):
 def test_without_an_encoder_the_maps_are_there(result, tmp_path, monkeypatch):
     monkeypatch.setattr(_movie.av, "codecs_available", {"png"})
     with pytest.raises(MissingRequirementError, match=r"overlay\.mp4: this build of PyAV"):
-        uncertainty.UncertaintyExporter().export(result, tmp_path)
+        exporter().export(result, tmp_path)
     assert len(list((tmp_path / "uncertainty").glob("*.png"))) == 3
     assert not (tmp_path / "uncertainty" / "overlay.mp4").exists()
 
@@ -160,14 +193,14 @@ def test_without_an_encoder_the_maps_are_there(result, tmp_path, monkeypatch):
 def test_a_folder_in_the_way(result, tmp_path):
     (tmp_path / "uncertainty").write_text("a file")
     with pytest.raises(UsageError, match=r"cannot make the folder .*uncertainty"):
-        uncertainty.UncertaintyExporter().export(result, tmp_path)
+        exporter().export(result, tmp_path)
 
 
 def test_two_exports_give_the_same_bytes(result, tmp_path):
     first, second = tmp_path / "a", tmp_path / "b"
     for folder in (first, second):
         folder.mkdir()
-        uncertainty.UncertaintyExporter().export(result, folder)
+        exporter().export(result, folder)
     for path in (first / "uncertainty").iterdir():
         assert path.read_bytes() == (second / "uncertainty" / path.name).read_bytes()
 
@@ -177,6 +210,13 @@ def test_an_encoder_that_fails_leaves_no_file(result, tmp_path, monkeypatch):
         raise av.error.ExternalError(1, "no luck")
 
     monkeypatch.setattr(_movie, "_encode", fail)
-    with pytest.raises(DroidwError, match=r"overlay\.mp4: the encoder \w+ failed: .*no luck"):
-        uncertainty.UncertaintyExporter(maps=False).export(result, tmp_path)
+    with pytest.raises(DroidwError, match=r"overlay\.mp4: the encoder \S+ failed: .*no luck"):
+        exporter(maps=False, masks=False).export(result, tmp_path)
     assert list((tmp_path / "uncertainty").iterdir()) == []
+
+
+def test_the_encoders_that_are_tried_are_free_to_use():
+    """x264 and x265 are in PyAV's wheel, and under the GPL."""
+    assert not {"libx264", "libx264rgb", "libx265"} & set(_movie.CODECS)
+    # What a run on the pinned wheel uses, browsers show.
+    assert _movie.CODECS[0] == "libvpx-vp9" and "libvpx-vp9" in av.codecs_available

@@ -32,8 +32,8 @@ def make_folder(path: Path) -> None:
         ) from error
 
 
-def write_map(path: Path, values: npt.NDArray[np.uint16]) -> None:
-    """Write a map [h,w] as a grey 16-bit PNG.
+def write_map(path: Path, values: npt.NDArray[np.uint16] | npt.NDArray[np.uint8]) -> None:
+    """Write a map [h,w] as a grey PNG of 16 or 8 bits.
 
     Raises:
         UsageError: the file cannot be written.

@@ -17,11 +17,18 @@ from droidw.io.files import atomic_write
 
 __all__ = ["CODECS", "stamps", "write_movie"]
 
-CODECS = ("libx264", "libopenh264", "mpeg4")
-"""Encoders in the order in which they are taken; every player and browser shows the first two."""
+CODECS = ("libvpx-vp9", "libsvtav1", "libopenh264", "mpeg4")
+"""Encoders in the order in which they are taken; every browser shows the first three.
+
+None is under the GPL: `libx264`, which PyAV's wheel has too, is, and is never used.
+"""
 
 _BASE = Fraction(1, 1000)
-_SETTINGS = {"libx264": {"preset": "superfast", "crf": "21"}}
+_SETTINGS = {
+    # With a bit rate of 0 the quality is constant.
+    "libvpx-vp9": {"deadline": "realtime", "cpu-used": "8", "crf": "24", "row-mt": "0"},
+    "libsvtav1": {"preset": "10", "crf": "28", "svtav1-params": "lp=1"},
+}
 _BITS_PER_PIXEL = 2.5  # for encoders without a setting for quality
 
 
@@ -117,8 +124,9 @@ def _packets(
             video.pix_fmt = "yuv420p"
             context = video.codec_context
             context.time_base, context.max_b_frames, context.thread_count = _BASE, 0, 1
-            if codec not in _SETTINGS:
-                video.bit_rate = max(100_000, round(_BITS_PER_PIXEL * width * height * rate))
+            known = codec in _SETTINGS
+            bits = max(100_000, round(_BITS_PER_PIXEL * width * height * rate))
+            video.bit_rate = 0 if known else bits
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
         frame.pts, frame.time_base = stamp, _BASE
         yield from video.encode(frame)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from droidw.slam.frame import KeyframeRecord
 
-__all__ = ["overlays"]
+__all__ = ["overlays", "spread"]
 
 _WARM = (255, 92, 20)  # RGB
 
@@ -33,17 +33,12 @@ def overlays(
     if not keyframes:
         return
     height, width = keyframes[0].image.shape[:2]
-    # Pixel (x, y) of the picture is taken from the grid at (x - offset) / stride.
-    to_grid = np.array([[1 / stride, 0, -offset / stride], [0, 1 / stride, -offset / stride]])
     tint = np.empty((height, width, 3), np.uint8)
     tint[:] = _WARM
     for keyframe in keyframes:
         # A cell without a weight is not called moving.
         lost = 1 - np.clip(np.nan_to_num(keyframe.weight.astype(np.float32), nan=1.0), 0, 1)
-        share = cv2.warpAffine(
-            alpha * lost, to_grid, (width, height),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
-        )  # fmt: skip
+        share = spread(alpha * lost, stride, offset, (width, height))
         blended = cv2.blendLinear(
             np.ascontiguousarray(keyframe.image), tint,
             np.asarray(1 - share, np.float32), np.asarray(share, np.float32),
@@ -51,6 +46,19 @@ def overlays(
         picture = np.asarray(blended, dtype=np.uint8)
         _stamp(picture, f"{keyframe.time - start:.2f} s  #{keyframe.index:06d}")
         yield picture
+
+
+def spread(
+    values: npt.NDArray[np.float32], stride: int, offset: float, size: tuple[int, int]
+) -> npt.NDArray[np.float32]:
+    """Values [h,w] of the grid at every pixel of a picture of `size` (width, height), bilinear."""
+    # Pixel (x, y) of the picture is taken from the grid at (x - offset) / stride.
+    to_grid = np.array([[1 / stride, 0, -offset / stride], [0, 1 / stride, -offset / stride]])
+    found = cv2.warpAffine(
+        values, to_grid, size,
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
+    )  # fmt: skip
+    return np.asarray(found, dtype=np.float32)
 
 
 def _stamp(picture: npt.NDArray[np.uint8], text: str) -> None:

@@ -1,4 +1,4 @@
-"""Exporter `uncertainty`: the maps as 16-bit pictures, and a video to look at them."""
+"""Exporter `uncertainty`: maps as 16-bit pictures, masks of what moves, a video to look at."""
 
 from __future__ import annotations
 
@@ -30,6 +30,17 @@ class UncertaintyOptions:
     maps: bool = field(
         default=True, metadata={"help": "write the maps, uncertainty/NNNNNN.png and scale.json"}
     )
+    masks: bool = field(
+        default=True, metadata={"help": "write masks/NNNNNN.png: 255 where something moves"}
+    )
+    mask_below: float = field(
+        default=0.5,
+        metadata={
+            "help": "a mask marks what kept less than this share of its weight",
+            "gt": 0,
+            "le": 1,
+        },
+    )
     video: bool = field(default=True, metadata={"help": "write uncertainty/overlay.mp4"})
     alpha: float = field(
         default=0.65,
@@ -39,6 +50,8 @@ class UncertaintyOptions:
     def __post_init__(self) -> None:
         if not 0 <= self.alpha <= 1:
             raise ValueError(f"alpha must lie between 0 and 1, not {self.alpha}")
+        if not 0 < self.mask_below <= 1:
+            raise ValueError(f"mask_below must lie in (0, 1], not {self.mask_below}")
 
 
 def encode(uncertainty: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
@@ -51,20 +64,21 @@ def encode(uncertainty: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
 
 
 class UncertaintyExporter:
-    """Writes `uncertainty/` of the run folder, nothing at all for a run without keyframes.
+    """Writes `uncertainty/` and `masks/`, nothing at all for a run without keyframes.
 
     `NNNNNN.png`, named by the index of the frame, is the map of one keyframe on the grid of the
     run, one 16-bit value per cell; it is not enlarged, since a cell is what was estimated. What
     the values mean is in `scale.json`. `overlay.mp4` shows the keyframes at working size, each
     from its own time on, tinted where uncertainty took away the weight in bundle adjustment.
+    `masks/NNNNNN.png` is the same as black and white at working size, and an input that
+    `--masks` takes. Weights are those of bundle adjustment, the masks of the user included.
 
     Args:
-        maps, video: what to write.
-        alpha: opacity of the tint where no weight is left.
+        options: what to write.
     """
 
-    def __init__(self, maps: bool = True, video: bool = True, alpha: float = 0.65) -> None:
-        self._maps, self._video, self._alpha = maps, video, alpha
+    def __init__(self, options: UncertaintyOptions | None = None) -> None:
+        self._options = options or UncertaintyOptions()
 
     def export(self, result: RunResult, folder: Path) -> list[Path]:
         """Write maps and video.
@@ -73,14 +87,43 @@ class UncertaintyExporter:
             UsageError: the folder cannot be written to.
             MissingRequirementError: PyAV has no encoder; the maps are written all the same.
         """
-        if not result.keyframes or not (self._maps or self._video):
+        options = self._options
+        if not result.keyframes:
             return []
         from droidw_plugins.exporters._maps import make_folder
 
+        written = []
+        if options.masks:
+            make_folder(folder / "masks")
+            written += self._write_masks(result, folder / "masks")
         folder = folder / "uncertainty"
-        make_folder(folder)
-        written = self._write_maps(result, folder) if self._maps else []
-        return written + ([self._write_video(result, folder)] if self._video else [])
+        if options.maps or options.video:
+            make_folder(folder)
+        if options.maps:
+            written += self._write_maps(result, folder)
+        return written + ([self._write_video(result, folder)] if options.video else [])
+
+    def _write_masks(self, result: RunResult, folder: Path) -> list[Path]:
+        from droidw_plugins.exporters._maps import write_map, write_scale
+        from droidw_plugins.exporters._overlay import spread
+
+        height, width = result.keyframes[0].image.shape[:2]
+        size, written = (width, height), []
+        for keyframe in result.keyframes:
+            # A cell without a weight is not called moving.
+            weight = np.nan_to_num(keyframe.weight, nan=1.0).astype(np.float32)
+            share = spread(weight, result.stride, result.offset, size)
+            path = folder / f"{keyframe.index:06d}.png"
+            write_map(path, np.where(share < self._options.mask_below, 255, 0).astype(np.uint8))
+            written.append(path)
+        facts = {
+            "mask": f"255: kept less than {self._options.mask_below:g} of its weight; 0: static",
+            "named": "index",
+            "index": "of the frame in the source, counted from 0",
+            "picture": list(size),
+        }
+        write_scale(folder / "scale.json", facts)
+        return [*written, folder / "scale.json"]
 
     def _write_maps(self, result: RunResult, folder: Path) -> list[Path]:
         from droidw_plugins.exporters._maps import write_map, write_scale
@@ -112,18 +155,18 @@ class UncertaintyExporter:
         # Stamps count from the first frame of the run: times of day do not fit a small picture.
         first = float(result.trajectory.times[0]) if len(result.trajectory) else times[0]
         path = folder / "overlay.mp4"
-        pictures = overlays(keyframes, result.stride, result.offset, first, self._alpha)
+        pictures = overlays(keyframes, result.stride, result.offset, first, self._options.alpha)
         write_movie(path, pictures, times)
         return path
 
 
 def _make(options: UncertaintyOptions, context: BuildContext) -> Exporter:
-    return UncertaintyExporter(options.maps, options.video, options.alpha)
+    return UncertaintyExporter(options)
 
 
 COMPONENT: Component[Exporter] = Component(
     name="uncertainty",
-    summary="uncertainty/: 16-bit maps of the keyframes and an overlay video",
+    summary="uncertainty/ and masks/: 16-bit maps and masks of the keyframes, an overlay video",
     factory=_make,
     options=UncertaintyOptions,
     requires=("av",),

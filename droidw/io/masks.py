@@ -1,0 +1,119 @@
+"""Masks that a user gives of what is to be ignored: which belongs to which picture, and reading."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from droidw.errors import InputError
+from droidw.slam.frame import RawFrame
+
+__all__ = ["UserMasks"]
+
+_LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
+_LOSSY = (".jpg", ".jpeg")
+_SAYS = "a mask is a picture per frame: black is used, everything else is ignored"
+
+
+class UserMasks:
+    """Masks in a folder, looked up frame by frame; safe to call from any thread.
+
+    A mask belongs to the picture of the same name (`0012.png` to `0012.jpg`). Where the name of
+    the first picture is not among the masks, they go by order if there are as many as pictures;
+    else by number, if their names are indices of frames counted from 0 (`000012.png`, as droidw
+    writes them). Masks that droidw wrote (`masks/scale.json` says so) always go by number.
+
+    Args:
+        folder: of pictures; black is used, everything else is ignored (a JPEG: what is brighter
+            than half, since its black is not clean).
+        least, most: how many pictures the source has, before any selection: at least, and at
+            most; None where that is unknown.
+    Raises:
+        InputError: the folder is not there or holds no masks.
+    """
+
+    def __init__(self, folder: Path, least: int = 0, most: int | None = None) -> None:
+        if not folder.is_dir():
+            raise InputError(f"input.masks: {folder}: there is no such folder", _SAYS)
+        files = [p for p in folder.iterdir() if p.suffix.lower() in (*_LOSSLESS, *_LOSSY)]
+        if not files:
+            raise InputError(f"input.masks: {folder}: holds no masks", _SAYS)
+        self.folder = folder
+        self._least, self._most = least, most
+        self._asked: set[int] = set()
+        self._missing: set[int] = set()
+        self._files = sorted(files)
+        self._by_name = {path.stem: path for path in self._files}
+        self._by_index: dict[int, Path] | None = _numbers(files) if _written_by_us(folder) else None
+        self._settled = self._by_index is not None
+
+    def of(self, frame: RawFrame) -> npt.NDArray[np.bool_] | None:
+        """The mask [H,W] of a picture, True where it is to be ignored; None if it has none.
+
+        Raises:
+            InputError: the masks belong to other pictures, or the file is no picture.
+        """
+        if not self._settled:
+            self._settle(frame)
+        path = (
+            self._by_name.get(Path(frame.name).stem)
+            if self._by_index is None
+            else self._by_index.get(frame.index)
+        )
+        self._asked.add(frame.index)
+        if path is None:
+            self._missing.add(frame.index)
+            return None
+        picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        if picture is None:
+            raise InputError(f"input.masks: {path}: cannot be read as a picture")
+        least = 127 if path.suffix.lower() in _LOSSY else 0
+        return np.asarray((np.asarray(picture) > least).any(axis=2))
+
+    def problems(self) -> list[str]:
+        """Sentences about pictures that had no mask."""
+        if not self._missing:
+            return []
+        return [
+            f"{len(self._missing)} of {len(self._asked)} pictures have no mask in {self.folder}, "
+            "and were used whole"
+        ]
+
+    def _settle(self, first: RawFrame) -> None:
+        """Decide by the first picture how masks are found."""
+        self._settled = True
+        stem = Path(first.name).stem
+        if stem in self._by_name:
+            return
+        count, least, most = len(self._files), self._least, self._most
+        if least and least <= count and (most is None or count <= most):
+            self._by_index = dict(enumerate(self._files))
+            return
+        numbers = _numbers(self._files)
+        if len(numbers) == count and (most is None or max(numbers) < most):
+            self._by_index = numbers
+            return
+        pictures = f"{least}" if least else "an unknown number of"
+        raise InputError(
+            f"input.masks: {self.folder}: its {count} masks cannot be laid on {pictures} pictures: "
+            f"none is called '{stem}' like the first picture, and the count is another",
+            "name each mask like its picture (an all-black one for the first, if nothing is to be "
+            "ignored there), or give one mask per picture",
+        )
+
+
+def _numbers(files: list[Path]) -> dict[int, Path]:
+    return {int(path.stem): path for path in files if path.stem.isdecimal()}
+
+
+def _written_by_us(folder: Path) -> bool:
+    """Whether the exporter wrote these masks, named by the index of the frame."""
+    try:
+        facts = json.loads((folder / "scale.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(facts, dict) and facts.get("named") == "index"
