@@ -24,6 +24,7 @@ VERBS: Mapping[str, str] = {
     "eval": "droidw.cli.evaluate",
     "list-plugins": "droidw.cli.list_plugins",
     "demo": "droidw.cli.demo",
+    "weights": "droidw.cli.weights",
     "doctor": "droidw.cli.doctor",
 }
 """Verb -> the module that holds it, in the order of the help text."""

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import re
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from droidw.errors import InputError, MissingRequirementError
+from droidw.io.download import sha256_of
+from droidw.io.download_page import looks_like_html
 from droidw.plugin.weights import WeightsFile, find_weights, weights_name
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["find", "load_state", "looks_like_html", "read_state"]
+__all__ = ["RECORDS", "find", "fingerprint", "load_state", "read_records", "read_state"]
+
+RECORDS = "weights.json"
+"""File beside the weights that says what each of them is, with its hash."""
 
 _WRAPPERS = ("state_dict", "model", "model_state_dict")
 
@@ -33,7 +39,7 @@ def load_state(folder: Path | None, name: str | WeightsFile) -> dict[str, Tensor
         name: name without ending ("droid"), or the record, which also knows the published name.
     Raises:
         MissingRequirementError: it is not there; says what to type.
-        InputError: as `read_state`.
+        InputError: as `read_state`, or it has changed since it was fetched.
     """
     path = find(folder, name)
     if path is None:
@@ -43,7 +49,46 @@ def load_state(folder: Path | None, name: str | WeightsFile) -> dict[str, Tensor
             f"download them: droidw weights fetch {stem}\n"
             "or, where they are on disk already: droidw weights add FILE",
         )
+    if path.name in (row.get("file") for row in read_records(path.parent).values()):
+        fingerprint(path)
     return read_state(path)
+
+
+def read_records(folder: Path) -> dict[str, dict[str, Any]]:
+    """What is recorded of the files in a folder of weights, by name; empty where nothing is."""
+    try:
+        found = json.loads((folder / RECORDS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(found, dict):
+        return {}
+    return {str(name): row for name, row in found.items() if isinstance(row, dict)}
+
+
+def fingerprint(path: Path, *, afresh: bool = False) -> str:
+    """SHA-256 of a weights file in hex; the recorded one while size and time are as recorded.
+
+    Args:
+        path: the file.
+        afresh: read the whole file whatever is recorded.
+    Raises:
+        InputError: it is not the file that was recorded.
+    """
+    rows = read_records(path.parent).values()
+    row = next((row for row in rows if row.get("file") == path.name), {})
+    stat = path.stat()
+    same = (row.get("size"), row.get("mtime_ns")) == (stat.st_size, stat.st_mtime_ns)
+    if same and not afresh:
+        return str(row["sha256"])
+    digest = sha256_of(path)
+    if row and digest != row.get("sha256"):
+        raise InputError(
+            f"{path} has changed since it was recorded: SHA-256 is {digest}, was "
+            f"{row.get('sha256')}",
+            "fetch it again: droidw weights fetch --force NAME\n"
+            "or, where it was replaced on purpose: droidw weights add FILE",
+        )
+    return digest
 
 
 def read_state(path: Path) -> dict[str, Tensor]:
@@ -68,14 +113,6 @@ def read_state(path: Path) -> dict[str, Tensor]:
     # Eight bytes of length, then JSON: the ending of the name may be wrong.
     is_safetensors = head[8:9] == b"{" or path.suffix == ".safetensors"
     return _tensors(path, _read_safetensors(path) if is_safetensors else _read_torch(path))
-
-
-def looks_like_html(head: bytes) -> bool:
-    """Whether the first bytes of a file are those of a web page."""
-    start = head.lstrip(b"\xef\xbb\xbf \t\r\n")[:200].lower()
-    return start.startswith((b"<!doctype html", b"<html", b"<head", b"<?xml")) or (
-        start.startswith(b"<!--") and b"<html" in head.lower()
-    )
 
 
 def _read_safetensors(path: Path) -> object:

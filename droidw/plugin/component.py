@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Generic,
+    Literal,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from droidw.plugin.weights import WeightsFile
 
@@ -82,3 +91,19 @@ class Component(Generic[T]):
         if not callable(self.weights):
             return tuple(self.weights)
         return tuple(self.weights(self.options() if options is None else options))
+
+    def all_weights(self) -> tuple[str | WeightsFile, ...]:
+        """The weights that the part may need: with its defaults, and with each choice of options.
+
+        Choices are options of type `Literal` and switches, changed one at a time.
+        """
+        found = dict.fromkeys(self.weights_for())
+        if callable(self.weights):
+            hints = get_type_hints(self.options)
+            for option in fields(self.options):
+                kind = hints[option.name]
+                values = get_args(kind) if get_origin(kind) is Literal else ()
+                for value in (False, True) if kind is bool else values:
+                    changed = replace(self.options(), **{option.name: value})
+                    found.update(dict.fromkeys(self.weights_for(changed)))
+        return tuple(found)

@@ -24,7 +24,7 @@ DROID = WeightsFile(
     size=16_000_000,
     licence="BSD-3-Clause (code); weights: nothing separate stated",
     file="droid.pth",
-    check="droidw_plugins._weights_check:droid",
+    check="droidw_plugins.correspondence._droid_state:check_state",
     reference="Teed and Deng, DROID-SLAM, NeurIPS 2021; github.com/princeton-vl/DROID-SLAM",
 )
 
