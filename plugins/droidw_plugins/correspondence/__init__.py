@@ -17,7 +17,8 @@ __all__ = ["droidw_correspondence_ops"]
 @hookimpl
 def droidw_correspondence_ops() -> Iterable[Component[Correspondence]]:
     """Light records only: the factory of each imports what it needs."""
-    from droidw_plugins.correspondence import flow, synthetic
+    from droidw_plugins.correspondence import droid, flow, synthetic
 
+    yield droid.COMPONENT
     yield flow.COMPONENT
     yield synthetic.COMPONENT

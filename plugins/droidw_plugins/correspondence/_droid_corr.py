@@ -28,7 +28,7 @@ _TOGETHER = {"cpu": 1, "cuda": 16}
 
 def smallest_side() -> int:
     """Cells that a grid needs each way for all levels to have one."""
-    return 2 ** (LEVELS - 1)
+    return 1 << (LEVELS - 1)
 
 
 class Pyramid:
@@ -46,8 +46,8 @@ class Pyramid:
         self.columns = sum(counts)
 
     def features(self, fmap: Tensor) -> Tensor:
-        """Features [128,h,w], and their 2x2 means again and again, as columns [128,S]."""
-        levels = [fmap[None]]
+        """A quarter of the features [128,h,w], and their 2x2 means again and again, [128,S]."""
+        levels = [fmap[None] / 4.0]
         for _ in range(LEVELS - 1):
             levels.append(F.avg_pool2d(levels[-1], 2, stride=2))
         return torch.cat([level[0].flatten(1) for level in levels], dim=1)
@@ -59,8 +59,7 @@ def volume(fmap_i: Tensor, columns: Tensor) -> Tensor:
     Args:
         fmap_i: [128,h,w]. columns: `Pyramid.features` of frame j.
     """
-    # Both are divided by 4: a power of two, so it makes no difference where.
-    return (fmap_i.flatten(1) / 16.0).t() @ columns
+    return _cells(fmap_i) @ columns
 
 
 def lookup(volumes: Sequence[Tensor], coords: Tensor, pyramid: Pyramid) -> Tensor:
@@ -92,12 +91,17 @@ def lookup_lowmem(
 
     def fetch(edge: int, index: Tensor, out: Tensor) -> None:
         fmap_i, columns = pairs[edge]
-        cells = (fmap_i.flatten(1) / 16.0).t()
+        cells = _cells(fmap_i)
         for first in range(0, cells.shape[0], rows):
             part = slice(first, first + rows)
             out[part] = torch.gather(cells[part] @ columns, 1, index[part])
 
     return _lookup(fetch, coords, pyramid)
+
+
+def _cells(fmap: Tensor) -> Tensor:
+    """A quarter of the features [128,h,w] as rows [h*w,128]."""
+    return (fmap.flatten(1) / 4.0).t()
 
 
 def _lookup(

@@ -20,10 +20,15 @@ def normalise(images: Tensor) -> Tensor:
 
 
 def _norm(x: Tensor) -> Tensor:
-    """Every channel of every picture to mean 0 and variance 1; statistics in float32."""
-    variance, mean = torch.var_mean(x.float(), dim=(2, 3), correction=0, keepdim=True)
-    scale = (variance + 1e-5).rsqrt()
-    return torch.addcmul(-mean * scale, x.float(), scale).to(x.dtype)
+    """Every channel of every picture to mean 0 and variance 1 (eps 1e-5)."""
+    if x.is_cuda:
+        return F.instance_norm(x)
+    # Sums down the rows of [pixels, channels] are quick and exact with channels last, where
+    # torch's own takes ten times as long.
+    rows = x.permute(0, 2, 3, 1).float()
+    centred = rows - rows.flatten(1, 2).mean(1)[:, None, None]
+    variance = (centred * centred).flatten(1, 2).mean(1)[:, None, None]
+    return centred.mul_((variance + 1e-5).rsqrt()).to(x.dtype).permute(0, 3, 1, 2)
 
 
 class _Block(nn.Module):

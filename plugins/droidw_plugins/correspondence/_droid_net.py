@@ -39,14 +39,15 @@ class DroidNet(nn.Module):
         Raises:
             InputError: as `check_state`.
         """
-        tensors = {
-            key: value.detach().to(device=device, dtype=torch.float32)
-            for key, value in check_state(state).items()
-        }
+        tensors = {}
+        for key, value in check_state(state).items():
+            tensor = value.detach().to(device=device, dtype=torch.float32)
+            last = torch.channels_last if tensor.dim() == 4 else torch.contiguous_format
+            tensors[key] = tensor.contiguous(memory_format=last)
         with torch.device("meta"):
             net = cls()
         net.load_state_dict(tensors, strict=True, assign=True)
-        return net.requires_grad_(False).eval().to(memory_format=torch.channels_last)
+        return net.requires_grad_(False).eval()
 
     def features(self, images: Tensor) -> Tensor:
         """Features [B,128,h,w] of RGB pictures [B,3,H,W] in [0,1]."""

@@ -75,12 +75,9 @@ class _GRU(nn.Module):
     def everywhere(self, net: Tensor) -> Tensor:
         """Share of the global context and all biases in z, r and q, [E,384,1,1]."""
         g = (torch.sigmoid(self.w(net)) * net).mean(dim=(2, 3))
-        each = (self.convz_glo, self.convr_glo, self.convq_glo)
-        weight = torch.cat([c.weight.flatten(1) for c in each])
-        biases = [c.bias for c in each], [c.bias for c in (self.convz, self.convr, self.convq)]
-        bias = torch.cat([b for b in biases[0] if b is not None])
-        bias = bias + torch.cat([b for b in biases[1] if b is not None])
-        return F.linear(g, weight, bias)[:, :, None, None]
+        weight, bias = _together(self.convz_glo, self.convr_glo, self.convq_glo)
+        _, own = _together(self.convz, self.convr, self.convq)
+        return F.linear(g, weight.flatten(1), bias + own)[:, :, None, None]
 
 
 class _Aggregation(nn.Module):
@@ -183,9 +180,8 @@ class UpdateOperator(nn.Module):
 
     def _heads(self, net: Tensor, aggregate: bool) -> Update:
         """All 3x3 convolutions of the new hidden state at once."""
-        first = [self.delta[0], self.weight[0]] + ([self.agg.conv1] if aggregate else [])
-        weight = torch.cat([c.weight for c in first])
-        bias = torch.cat([c.bias for c in first])
+        first = [self.delta[0], self.weight[0]]
+        weight, bias = _together(*first, self.agg.conv1) if aggregate else _together(*first)
         hidden = F.relu(F.conv2d(net, weight, bias, padding=1), inplace=True)
         delta = _last(self.delta[2](hidden[:, :128]))
         sure = torch.sigmoid(_last(self.weight[2](hidden[:, 128:256])))
@@ -196,6 +192,13 @@ def _head() -> nn.Sequential:
     return nn.Sequential(
         nn.Conv2d(128, 128, 3, padding=1), nn.ReLU(True), nn.Conv2d(128, 2, 3, padding=1)
     )
+
+
+def _together(*layers: nn.Module) -> tuple[Tensor, Tensor]:
+    """Weight and bias of one convolution that does the work of several."""
+    convolutions = [layer for layer in layers if isinstance(layer, nn.Conv2d)]
+    biases = [c.bias for c in convolutions if c.bias is not None]
+    return torch.cat([c.weight for c in convolutions]), torch.cat(biases)
 
 
 def _columns(weight: Tensor, inputs: tuple[slice, ...]) -> Tensor:
