@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -270,7 +271,8 @@ class WeightsStore:
                 "make room there, or name another folder: DROIDW_WEIGHTS=FOLDER",
             ) from error
         finally:
-            hidden.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                hidden.unlink(missing_ok=True)
         self._record(file, path, sha256_of(path), source, published)
         return path
 
