@@ -49,7 +49,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--delta",
         metavar="N",
         default="1",
-        help="RPE: how far apart two poses are, in frames (10) or seconds (0.5s) (default: 1)",
+        help="RPE: how far apart two poses are, in frames (10), seconds (0.5s) or metres of the "
+        "reference's path (0.2m) (default: 1)",
+    )
+    parser.add_argument(
+        "--normalise",
+        choices=("none", "displacement", "path"),
+        default="none",
+        help="divide all lengths by the distance from the first to the last pose of the reference "
+        "(the unit of published DyCheck figures), or by the length of its path (default: none)",
     )
     parser.add_argument(
         "--unit", metavar="U", default="m", help="unit of the reference, for display (default: m)"
@@ -60,6 +68,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="masks of what moves, to score uncertainty/ of the run folder; "
         "default: mask/ in the source of the run, if there is one",
     )
+    parser.add_argument(
+        "--masks-after",
+        metavar="N",
+        type=int,
+        default=0,
+        help="leave the first N keyframes out of the score of the masks (default: 0)",
+    )
+    parser.add_argument(
+        "--plot", metavar="DIR", help="draw paths and errors into DIR, as SVG for any browser"
+    )
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     parser.add_argument(
         "--save", action="store_true", help="also write them to metrics.json in the run folder"
@@ -69,9 +87,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def main(args: argparse.Namespace) -> int:
     """Run `droidw eval` and return the exit code."""
     from droidw.eval.metrics import Delta
-    from droidw.eval.summary import evaluate, table, write_metrics
+    from droidw.eval.summary import evaluate, write_metrics
+    from droidw.eval.text import table
 
     path = Path(args.path)
+    if args.masks_after < 0:
+        raise UsageError(f"--masks-after counts keyframes from 0, and {args.masks_after} is less")
     if args.save and not path.is_dir():
         raise UsageError(f"--save writes into a run folder, and {path} is none")
     evaluation = evaluate(
@@ -81,14 +102,21 @@ def main(args: argparse.Namespace) -> int:
         max_diff=args.t_max_diff,
         offset=args.t_offset,
         delta=Delta.parse(args.delta),
+        normalise=args.normalise,
         unit=args.unit,
         masks=Path(args.masks) if args.masks else None,
+        masks_after=args.masks_after,
     )
     if args.json:
         text = json.dumps(evaluation.to_dict(), indent=2, allow_nan=False)
     else:
         text = table(evaluation)
     sys.stdout.write(text + "\n")
+    if args.plot:
+        from droidw.eval.plots import write_plots
+
+        for drawn in write_plots(evaluation, Path(args.plot)):
+            sys.stderr.write(f"written: {drawn}\n")
     if args.save:
         saved = write_metrics(evaluation, path)
         sys.stderr.write(f"written: {saved}\n")

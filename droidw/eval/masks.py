@@ -128,13 +128,17 @@ def score_masks(
     )
 
 
-def score_folder(uncertainty: Path, masks: Path) -> MaskScore:
+def score_folder(uncertainty: Path, masks: Path, after: int = 0) -> MaskScore:
     """Score the maps `uncertainty/NNNNNN.png` (named by frame index) against a folder of masks.
 
     Both are taken to show the same field of view; a mask is reduced to the size of its map.
 
+    Args:
+        uncertainty: folder of maps. masks: folder of masks, see `find_masks`.
+        after: the first maps, so many, are left out: a model that learns online knows nothing yet.
     Raises:
-        InputError: if a folder is missing, a file cannot be read, or no map has a mask.
+        InputError: if a folder is missing, a file cannot be read, no map has a mask, or none is
+            left.
     """
     maps = {
         int(path.stem): path
@@ -145,6 +149,12 @@ def score_folder(uncertainty: Path, masks: Path) -> MaskScore:
         raise InputError(
             f"{uncertainty}: holds no uncertainty maps", "expected 16-bit pictures NNNNNN.png"
         )
+    if after >= len(maps):
+        raise InputError(
+            f"{uncertainty}: of {len(maps)} uncertainty maps, none is left after the first {after}",
+            "leave fewer out: --masks-after N",
+        )
+    maps = {index: maps[index] for index in sorted(maps)[after:]}
     known = find_masks(masks)
     notes: list[str] = []
     pairs = [(maps[index], known[index]) for index in sorted(maps) if index in known]

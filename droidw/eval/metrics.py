@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -11,44 +10,23 @@ import numpy.typing as npt
 
 from droidw.errors import InputError, UsageError
 from droidw.eval.associate import DEFAULT_MAX_DIFF, associate
+from droidw.eval.relative import Delta, pairs, relative_errors
 from droidw.geometry.align import umeyama
 from droidw.slam.frame import Trajectory
 
-__all__ = ["Align", "Delta", "Statistics", "TrajectoryScore", "path_length", "score"]
+__all__ = [
+    "Align",
+    "Delta",
+    "Normalise",
+    "Statistics",
+    "TrajectoryScore",
+    "path_length",
+    "score",
+]
 
 Array = npt.NDArray[np.float64]
 Align = Literal["sim3", "se3", "scale", "none"]
-
-
-@dataclass(frozen=True)
-class Delta:
-    """How far apart the two poses of a relative error are: a count of frames, or seconds."""
-
-    value: float = 1.0
-    unit: Literal["frames", "seconds"] = "frames"
-
-    @classmethod
-    def parse(cls, text: str) -> Delta:
-        """Read "10" as ten frames and "0.5s" as half a second.
-
-        Raises:
-            UsageError: if the text is neither.
-        """
-        match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(s?)\s*", text)
-        if match and float(match[1]) > 0:
-            if match[2]:
-                return cls(float(match[1]), "seconds")
-            if float(match[1]).is_integer():
-                return cls(float(match[1]), "frames")
-        raise UsageError(
-            f"--delta: '{text}' is neither a whole number of frames nor a number of seconds",
-            "for example --delta 10 (frames) or --delta 0.5s (seconds)",
-        )
-
-    def __str__(self) -> str:
-        if self.unit == "seconds":
-            return f"{self.value:g} s"
-        return f"{self.value:g} frame" + ("" if self.value == 1 else "s")
+Normalise = Literal["none", "displacement", "path"]
 
 
 @dataclass(frozen=True)
@@ -82,11 +60,13 @@ class TrajectoryScore:
     Attributes:
         estimate, reference: labels of what was compared, such as file names.
         align: the alignment applied to the estimate first.
-        unit: unit of all lengths, that of the reference.
+        normalise: by what length of the reference all lengths were divided.
+        unit: unit of all lengths: that of the reference, or that length.
         frames: usable poses of the estimate; matched: of these, with a pose of the reference.
         ref_frames: usable poses of the reference.
         skipped, ref_skipped: poses left out because a number in them was not finite.
-        max_diff: largest time difference of a matched pair that was allowed, seconds.
+        max_diff, worst_diff: largest time difference of a matched pair that was allowed, and that
+            occurred, seconds.
         scale: factor that was applied to the estimate.
         path_length: length of the reference over the matched frames.
         path_length_est: the same of the estimate after alignment.
@@ -97,12 +77,15 @@ class TrajectoryScore:
         rpe_pairs: number of pairs behind them.
         notes: sentences.
         times, errors: [M] stamps in seconds and position errors of the matched frames.
+        rpe_times, rpe_errors: [P] stamps of the first frames of the pairs, and their errors in
+            translation and in degrees, [P,2].
         aligned, truth: [M,3] camera centres, estimate after alignment and reference.
     """
 
     estimate: str
     reference: str
     align: Align
+    normalise: Normalise
     unit: str
     frames: int
     matched: int
@@ -110,6 +93,7 @@ class TrajectoryScore:
     skipped: int
     ref_skipped: int
     max_diff: float
+    worst_diff: float
     scale: float
     path_length: float
     path_length_est: float
@@ -124,6 +108,8 @@ class TrajectoryScore:
     errors: Array = field(repr=False, compare=False)
     aligned: Array = field(repr=False, compare=False)
     truth: Array = field(repr=False, compare=False)
+    rpe_times: Array = field(repr=False, compare=False)
+    rpe_errors: Array = field(repr=False, compare=False)
 
     @property
     def coverage(self) -> float:
@@ -141,6 +127,7 @@ class TrajectoryScore:
             "estimate": self.estimate,
             "reference": self.reference,
             "align": self.align,
+            "normalise": self.normalise,
             "unit": self.unit,
             "frames": self.frames,
             "matched": self.matched,
@@ -150,6 +137,7 @@ class TrajectoryScore:
             "skipped": self.skipped,
             "ref_skipped": self.ref_skipped,
             "max_diff": self.max_diff,
+            "worst_diff": self.worst_diff,
             "scale": self.scale,
             "path_length": self.path_length,
             "path_length_est": self.path_length_est,
@@ -176,6 +164,7 @@ def score(
     max_diff: float = DEFAULT_MAX_DIFF,
     offset: float = 0.0,
     delta: Delta | None = None,
+    normalise: Normalise = "none",
     unit: str = "m",
     names: tuple[str, str] = ("estimate", "reference"),
 ) -> TrajectoryScore:
@@ -186,26 +175,44 @@ def score(
     motion between every two matched frames that lie `delta` apart: its translation after
     alignment, and the angle between the two rotations, in degrees.
 
+    Args:
+        estimate, reference: what is compared.
+        align: how the estimate is laid on the reference.
+        max_diff, offset: as `associate` takes them, in seconds.
+        delta: of RPE; metres are in the unit of the reference, or of what it is normalised to.
+        normalise: divide all lengths by the distance between the first and the last pose of the
+            reference ("displacement": the unit of the published DyCheck figures, REFERENCE 6.4)
+            or by the length of its path ("path": what the paper says that unit is).
+        unit: name of the unit of the reference, for display.
+        names: labels of the two, for messages.
     Raises:
-        UsageError: for an unknown alignment.
+        UsageError: for an unknown alignment or normalisation.
         InputError: if stamps do not match or too few poses are usable.
     """
     if align not in get_args(Align):
         raise UsageError(f"'{align}' is no alignment", f"available: {', '.join(get_args(Align))}")
+    if normalise not in get_args(Normalise):
+        raise UsageError(
+            f"'{normalise}' is no normalisation", f"available: {', '.join(get_args(Normalise))}"
+        )
     delta = delta or Delta()
     notes: list[str] = []
     est, skipped = _usable(estimate, names[0], notes)
     ref, ref_skipped = _usable(reference, names[1], notes)
+    length = _length(ref.T_wc[:, :3], normalise, names[1])
     matches = associate(
         est.times, ref.times, max_diff, offset, minimum=3 if align in ("sim3", "se3") else 2
     )
     poses, truth = est.T_wc[matches.est], ref.T_wc[matches.ref]
+    # Both, so that without a scale in the alignment they still compare.
+    poses[:, :3] /= length
+    truth[:, :3] /= length
     times = ref.times[matches.ref]
     scale, R, t = _alignment(poses[:, :3], truth[:, :3], align, notes)
     aligned = scale * poses[:, :3] @ R.T + t
     errors = np.linalg.norm(aligned - truth[:, :3], axis=1)
-    first, second = _pairs(times, delta)
-    rpe_trans, rpe_rot = _relative_errors(poses, truth, scale, first, second)
+    first, second = pairs(times, truth[:, :3], delta)
+    rpe_trans, rpe_rot = relative_errors(poses, truth, scale, first, second)
     if len(matches) < len(est):
         notes.append(
             f"{len(est) - len(matches)} of {len(est)} poses have no reference within "
@@ -218,13 +225,15 @@ def score(
         estimate=names[0],
         reference=names[1],
         align=align,
-        unit=unit,
+        normalise=normalise,
+        unit=unit if normalise == "none" else normalise,
         frames=len(est),
         matched=len(matches),
         ref_frames=len(ref),
         skipped=skipped,
         ref_skipped=ref_skipped,
         max_diff=max_diff,
+        worst_diff=float(np.abs(matches.diff).max()),
         scale=scale,
         path_length=path_length(truth[:, :3]),
         path_length_est=path_length(aligned),
@@ -239,12 +248,29 @@ def score(
         errors=errors,
         aligned=aligned,
         truth=truth[:, :3].copy(),
+        rpe_times=times[first],
+        rpe_errors=np.stack([rpe_trans, rpe_rot], axis=1),
     )
 
 
 def path_length(centres: Array) -> float:
     """Sum of the distances between successive centres [N,3]."""
     return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
+
+
+def _length(centres: Array, normalise: Normalise, name: str) -> float:
+    """The length [1 or unit of the reference] by which all others are divided."""
+    if normalise == "none":
+        return 1.0
+    whole = path_length(centres)
+    length = whole if normalise == "path" else float(np.linalg.norm(centres[-1] - centres[0]))
+    if not length > 1e-6 * whole:
+        what = "moves nowhere" if not whole > 0 else "ends where it begins"
+        raise InputError(
+            f"{name}: {what}, so that nothing can be divided by its {normalise}",
+            "leave it as it is: --normalise none" + (" or --normalise path" if whole > 0 else ""),
+        )
+    return length
 
 
 def _statistics(errors: Array) -> Statistics:
@@ -287,61 +313,3 @@ def _alignment(
         return float(found.scale), np.eye(3), np.zeros(3)
     scale = float(found.scale) if align == "sim3" else 1.0
     return scale, np.asarray(found.R, dtype=np.float64), np.asarray(found.t, dtype=np.float64)
-
-
-def _pairs(times: Array, delta: Delta) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Every frame and the one `delta` later; in seconds, the nearest within a tenth of it."""
-    count = len(times)
-    if delta.unit == "frames":
-        step = int(delta.value)
-        first = np.arange(max(count - step, 0), dtype=np.int64)
-        return first, first + step
-    goal = times + delta.value
-    right = np.clip(np.searchsorted(times, goal), 0, count - 1)
-    left = np.maximum(right - 1, 0)
-    nearest = np.where(goal - times[left] <= times[right] - goal, left, right)
-    first = np.arange(count, dtype=np.int64)
-    good = (np.abs(times[nearest] - goal) <= 0.1 * delta.value) & (nearest > first)
-    return first[good], nearest[good].astype(np.int64)
-
-
-def _relative_errors(
-    est: Array,
-    truth: Array,
-    scale: float,
-    first: npt.NDArray[np.int64],
-    second: npt.NDArray[np.int64],
-) -> tuple[Array, Array]:
-    R_est, R_ref = _rotations(est[:, 3:]), _rotations(truth[:, 3:])
-    # Motion seen from the first of the two cameras: R_1^T R_2 and R_1^T (c_2 - c_1).
-    turn_est = R_est[first].transpose(0, 2, 1) @ R_est[second]
-    turn_ref = R_ref[first].transpose(0, 2, 1) @ R_ref[second]
-    step_est = scale * _rotate_back(R_est[first], est[second, :3] - est[first, :3])
-    step_ref = _rotate_back(R_ref[first], truth[second, :3] - truth[first, :3])
-    error = turn_ref.transpose(0, 2, 1) @ turn_est
-    # atan2 of sine and cosine keeps its digits at small angles, where acos of the trace does not.
-    axis = np.stack(
-        [
-            error[:, 2, 1] - error[:, 1, 2],
-            error[:, 0, 2] - error[:, 2, 0],
-            error[:, 1, 0] - error[:, 0, 1],
-        ],
-        axis=1,
-    )
-    angle = np.arctan2(np.linalg.norm(axis, axis=1), np.trace(error, axis1=1, axis2=2) - 1.0)
-    return np.linalg.norm(step_est - step_ref, axis=1), np.degrees(angle)
-
-
-def _rotate_back(R: Array, vectors: Array) -> Array:
-    return np.asarray(np.einsum("nji,nj->ni", R, vectors))
-
-
-def _rotations(q: Array) -> Array:
-    """Rotation matrices [N,3,3] of unit quaternions xyzw [N,4]."""
-    x, y, z, w = q.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -12,7 +12,7 @@ import yaml
 
 from droidw.errors import InputError, UsageError
 from droidw.eval.associate import DEFAULT_MAX_DIFF
-from droidw.eval.metrics import Align, Delta, TrajectoryScore, score
+from droidw.eval.metrics import Align, Delta, Normalise, TrajectoryScore, score
 from droidw.io.files import atomic_write
 from droidw.io.tum import read_tum
 
@@ -20,7 +20,14 @@ if TYPE_CHECKING:
     from droidw.eval.masks import MaskScore
     from droidw.slam.frame import Trajectory
 
-__all__ = ["Evaluation", "evaluate", "reference_file", "source_of", "table", "write_metrics"]
+__all__ = [
+    "Evaluation",
+    "evaluate",
+    "mask_score",
+    "reference_file",
+    "source_of",
+    "write_metrics",
+]
 
 
 @dataclass(frozen=True)
@@ -58,8 +65,10 @@ def evaluate(
     max_diff: float = DEFAULT_MAX_DIFF,
     offset: float = 0.0,
     delta: Delta | None = None,
+    normalise: Normalise = "none",
     unit: str = "m",
     masks: Path | None = None,
+    masks_after: int = 0,
 ) -> Evaluation:
     """Evaluate a run folder or a TUM file.
 
@@ -67,8 +76,9 @@ def evaluate(
         path: run folder with `trajectory.tum`, or a TUM file.
         reference: TUM file, folder that holds `groundtruth.txt`, or None to look in the source
             that the run folder names.
-        align, max_diff, offset, delta, unit: as for `score`.
+        align, max_diff, offset, delta, normalise, unit: as for `score`.
         masks: folder of masks, or None to look for `mask/` in the source of the run.
+        masks_after: leave so many keyframes at the start out of the score of the masks.
     Raises:
         UsageError: if no reference is given and none can be found.
         InputError: if a file is missing, is no trajectory or does not match.
@@ -90,6 +100,7 @@ def evaluate(
         "max_diff": max_diff,
         "offset": offset,
         "delta": delta,
+        "normalise": normalise,
         "unit": unit,
     }
     frames = _score_file(_File.read(file), truth, options)
@@ -102,7 +113,8 @@ def evaluate(
         except InputError as error:
             # A clip with two keyframes has a trajectory worth scoring all the same.
             notes.append(f"keyframes are not scored: {error.message}")
-    return Evaluation(frames, keyframes, _mask_score(run_dir, source, masks, notes), tuple(notes))
+    found = mask_score(run_dir, source, masks, masks_after)
+    return Evaluation(frames, keyframes, found, tuple(notes))
 
 
 @dataclass(frozen=True)
@@ -149,9 +161,19 @@ def _reference_of_source(source: Path | None) -> Path:
     )
 
 
-def _mask_score(
-    run_dir: Path | None, source: Path | None, masks: Path | None, notes: list[str]
+def mask_score(
+    run_dir: Path | None, source: Path | None, masks: Path | None = None, after: int = 0
 ) -> MaskScore | None:
+    """Score `uncertainty/` of a run folder, or None where there are no maps or no masks.
+
+    Args:
+        run_dir: the run folder, or None for a lone trajectory.
+        source: what the run was made from; masks: a folder instead of its `mask/`.
+        after: leave out so many keyframes at the start.
+    Raises:
+        UsageError: masks are given, and there are no maps to score.
+        InputError: a file cannot be read, or none belongs to another.
+    """
     maps = run_dir / "uncertainty" if run_dir else None
     have_maps = maps is not None and any(maps.glob("[0-9]*.png"))
     if masks is not None and not have_maps:
@@ -167,7 +189,7 @@ def _mask_score(
         masks = source / "mask"
     from droidw.eval.masks import score_folder
 
-    return score_folder(maps, masks)
+    return score_folder(maps, masks, after)
 
 
 def reference_file(reference: Path) -> Path:
@@ -222,61 +244,6 @@ def write_metrics(evaluation: Evaluation, run_dir: Path) -> Path:
     with atomic_write(path) as stream:
         stream.write(text.encode("utf-8"))
     return path
-
-
-def table(evaluation: Evaluation) -> str:
-    """The figures as text for a terminal, with the story behind them."""
-    columns = [("all frames", evaluation.frames)]
-    if evaluation.keyframes is not None:
-        columns.append(("keyframes", evaluation.keyframes))
-    first = evaluation.frames
-    unit = first.unit
-    rows: list[tuple[str, list[str]]] = [("", [name for name, _ in columns])]
-
-    def row(label: str, values: list[str]) -> None:
-        rows.append((label, values))
-
-    row("matched / poses", [f"{s.matched} / {s.frames}" for _, s in columns])
-    row(f"path length [{unit}]", [f"{s.path_length:.3f}" for _, s in columns])
-    row("scale applied", [f"{s.scale:.5g}" for _, s in columns])
-    for figure in ("rmse", "median", "mean", "max", "std"):
-        row(f"ATE {figure} [{unit}]", [f"{getattr(s.ate, figure):.4f}" for _, s in columns])
-    row("ATE rmse [% of path]", [_percent(s.ate_percent) for _, s in columns])
-    row(
-        f"RPE rmse [{unit}]",
-        [f"{s.rpe_trans.rmse:.4f}" if s.rpe_trans else "-" for _, s in columns],
-    )
-    row("RPE rmse [deg]", [f"{s.rpe_rot.rmse:.4f}" if s.rpe_rot else "-" for _, s in columns])
-    width = max(len(label) for label, _ in rows)
-    lines = [f"{first.estimate}  against  {first.reference}"]
-    lines += [
-        f"  {label:<{width}}  " + "".join(f"{value:>13}" for value in values)
-        for label, values in rows
-    ]
-    lines.append(
-        f"  alignment {first.align}; stamps within {first.max_diff:g} s; RPE over {first.delta}"
-        f" (all pairs); the matched frames span {100 * first.time_covered:.0f} % of the reference"
-    )
-    masks = evaluation.masks
-    if masks is not None:
-        lines.append(
-            f"  motion masks, {masks.frames} frames, {100 * masks.moving:.1f} % moving:"
-            f" AUC {_number(masks.auc)}  best F1 {_number(masks.f1)}  IoU {_number(masks.iou)}"
-        )
-    notes = [*evaluation.notes]
-    for _, scored in columns:
-        notes += scored.notes
-    notes += masks.notes if masks is not None else ()
-    lines += [f"  note: {note}" for note in dict.fromkeys(notes)]
-    return "\n".join(lines)
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3f}"
 
 
 def _finite(value: Any) -> Any:

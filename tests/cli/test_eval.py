@@ -76,6 +76,35 @@ def test_table_of_a_run_folder(places: tuple[Path, Path], capsys: pytest.Capture
     for said in ("all frames", "keyframes", "60 / 60", "10 / 10", "ATE rmse [m]", "scale applied",
                  "alignment sim3", "RPE over 0.5 s", "AUC 1.000"):  # fmt: skip
         assert said in out, said
+    assert "60 of 60 stamps matched with 60 of the reference; largest difference 0.0 ms" in out
+
+
+def test_normalised(places: tuple[Path, Path], capsys: pytest.CaptureFixture) -> None:
+    run, _ = places
+    assert run_eval(run, "--json") == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert run_eval(run, "--normalise", "displacement", "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    # The circle rises by 0.2 pi.
+    gap = 0.2 * np.pi
+    assert record["ate_rmse"] == pytest.approx(plain["ate_rmse"] / gap)
+    assert record["keyframes"]["ate_rmse"] == pytest.approx(plain["keyframes"]["ate_rmse"] / gap)
+    assert (record["normalise"], plain["normalise"]) == ("displacement", "none")
+    run_eval(run, "--normalise", "path")
+    out = capsys.readouterr().out
+    assert "ATE rmse [path]" in out and "all lengths are divided by the reference's path" in out
+
+
+def test_plots(places: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    run, _ = places
+    before = set(run.rglob("*"))
+    assert run_eval(run, "--plot", tmp_path / "new" / "plots", "--json") == 0
+    told = capsys.readouterr()
+    json.loads(told.out)
+    names = ["ate.svg", "rpe.svg", "trajectory.svg"]
+    assert sorted(p.name for p in (tmp_path / "new" / "plots").iterdir()) == names
+    assert all(name in told.err for name in names)
+    assert set(run.rglob("*")) == before
 
 
 def test_save_writes_into_the_run_folder(
@@ -142,6 +171,9 @@ def test_what_is_wrong_is_said(places: tuple[Path, Path], tmp_path: Path) -> Non
         ((run, "--ref", truth, "--delta", "0"), 2, "--delta"),
         ((run / "trajectory.tum", "--ref", truth, "--masks", source / "mask"), 2, "--masks"),
         ((run, "--ref", truth, "--masks", tmp_path / "no"), 3, "no such folder"),
+        ((run, "--ref", truth, "--masks-after", "2"), 3, "none is left after the first 2"),
+        ((run, "--ref", truth, "--masks-after", "-1"), 2, "--masks-after counts keyframes from 0"),
+        ((run, "--ref", truth, "--plot", truth), 2, "--plot: cannot make the folder"),
     ]
     for words, code, said in cases:
         error = refusal(*words)

@@ -161,3 +161,17 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 def test_masks_of_zeros_and_ones(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "m.png"), np.array([[0, 1]], np.uint8))
     assert read_mask(tmp_path / "m.png").tolist() == [[False, True]]
+
+
+def test_the_first_maps_may_be_left_out(tmp_path: Path) -> None:
+    root = folder(tmp_path, ["a", "b", "c"], listed=True)
+    # The first map marks the wrong half.
+    wrong = np.full((6, 8), 1000, np.uint16)
+    wrong[:, 4:] = 50000
+    cv2.imwrite(str(root / "uncertainty" / "000000.png"), wrong)
+    whole = score_folder(root / "uncertainty", root / "mask")
+    rest = score_folder(root / "uncertainty", root / "mask", after=1)
+    assert whole.auc is not None and whole.auc < 0.9
+    assert (rest.auc, rest.frames) == (1.0, 2)
+    with pytest.raises(InputError, match="of 3 uncertainty maps, none is left after the first 3"):
+        score_folder(root / "uncertainty", root / "mask", after=3)

@@ -99,7 +99,58 @@ def test_delta_in_frames_and_seconds() -> None:
     assert any("no two matched frames lie 0.4 s apart" in note for note in far.notes)
 
 
-@pytest.mark.parametrize("text", ["0", "-1", "1.5", "x", "2m", ""])
+def test_delta_in_metres_of_the_way_of_the_reference() -> None:
+    truth = straight([0, 1, 1, 1, 2, 4, 5])
+    est = straight([0, 1, 1, 1, 2, 4, 5.5])
+    found = score(est, truth, align="none", delta=Delta.parse("2m"))
+    # 0 -> 2, the three at 1 -> nothing at 3, 2 -> 4, and 4 -> nothing at 6.
+    assert found.rpe_times.tolist() == [0, 4]
+    assert found.rpe_trans is not None and found.rpe_trans.max == 0
+    one = score(est, truth, align="none", delta=Delta.parse("1m"))
+    # To the first of those that stand at 1; from 4 to 5 the estimate goes half a metre too far.
+    assert one.rpe_times.tolist() == [0, 1, 2, 3, 5]
+    assert one.rpe_errors[:, 0].tolist() == [0, 0, 0, 0, 0.5]
+    assert str(one.delta) == "1 m"
+
+
+def test_normalisation_divides_by_the_reference() -> None:
+    truth = random_walk(60, 4)
+    est = moved(truth, noise=0.01)
+    plain, shift, path = (
+        score(est, truth, normalise=name) for name in ("none", "displacement", "path")
+    )
+    gap = np.linalg.norm(truth.centres[-1] - truth.centres[0])
+    assert shift.ate.rmse == pytest.approx(plain.ate.rmse / gap)
+    assert path.ate.rmse == pytest.approx(plain.ate.rmse / path_length(truth.centres))
+    assert path.path_length == pytest.approx(1.0) and path.unit == "path"
+    assert shift.scale == pytest.approx(plain.scale)
+    assert shift.rpe_rot == plain.rpe_rot and shift.ate_percent == pytest.approx(plain.ate_percent)
+    # A reference in millimetres gives the same figures.
+    large = Trajectory(truth.times, truth.T_wc * np.array([1000.0] * 3 + [1.0] * 4))
+    again = score(est, large, normalise="displacement")
+    assert again.ate.rmse == pytest.approx(shift.ate.rmse)
+    # And so without a scale in the alignment, if the estimate is in millimetres too.
+    est_large = Trajectory(est.times, est.T_wc * np.array([1000.0] * 3 + [1.0] * 4))
+    for align in ("se3", "none"):
+        one = score(est, truth, align=align, normalise="path")
+        other = score(est_large, large, align=align, normalise="path")
+        assert one.ate.rmse == pytest.approx(other.ate.rmse)
+
+
+def test_what_cannot_be_normalised_is_refused() -> None:
+    loop = straight([0, 1, 2, 1, 0])
+    with pytest.raises(InputError, match="ends where it begins") as caught:
+        score(loop, loop, normalise="displacement", names=("a", "b"))
+    assert "--normalise path" in caught.value.hint
+    assert score(loop, loop, normalise="path").ate.rmse == pytest.approx(0, abs=1e-12)
+    still = straight([1.0] * 4)
+    with pytest.raises(InputError, match="b: moves nowhere"):
+        score(loop, still, normalise="path", names=("a", "b"))
+    with pytest.raises(UsageError, match="available: none, displacement, path"):
+        score(loop, loop, normalise="unit")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "1.5", "x", "2km", "", "0m"])
 def test_delta_refuses(text: str) -> None:
     with pytest.raises(UsageError, match="--delta"):
         Delta.parse(text)
@@ -204,3 +255,47 @@ def test_same_figures_as_evo(evo: SimpleNamespace, tmp_path: Path, align: str, s
     assert ours.matched == ref.num_poses == 60
     assert ours.path_length == pytest.approx(ref.path_length)
     assert ours.path_length_est == pytest.approx(mine.path_length)
+
+
+@pytest.mark.parametrize("metres", [0.3, 1.0])
+def test_same_figures_as_evo_over_metres(
+    evo: SimpleNamespace, tmp_path: Path, metres: float
+) -> None:
+    truth = random_walk(120, 5)
+    est_file = write(tmp_path / "est.tum", moved(truth, noise=0.01))
+    ref_file = write(tmp_path / "ref.tum", truth)
+    ours = score(read_tum(est_file), read_tum(ref_file), delta=Delta(metres, "metres"))
+    ref = evo.files.read_tum_trajectory_file(str(ref_file))
+    mine = evo.files.read_tum_trajectory_file(str(est_file))
+    mine.align(ref, correct_scale=True)
+    for relation, got in (
+        (evo.metrics.PoseRelation.translation_part, ours.rpe_trans),
+        (evo.metrics.PoseRelation.rotation_angle_deg, ours.rpe_rot),
+    ):
+        rpe = evo.metrics.RPE(
+            relation,
+            delta=metres,
+            delta_unit=evo.units.Unit.meters,
+            all_pairs=True,
+            pairs_from_reference=True,
+        )
+        rpe.process_data((ref, mine))
+        theirs = rpe.get_all_statistics()
+        assert got is not None and ours.rpe_pairs == len(rpe.error) > 20
+        for name in ("rmse", "mean", "median", "max", "std"):
+            assert getattr(got, name) == pytest.approx(theirs[name], rel=1e-7), (relation, name)
+
+
+def test_normalised_figures_as_published(evo: SimpleNamespace, tmp_path: Path) -> None:
+    """REFERENCE 6.4: the truth divided by its first-to-last distance, then evo with Sim(3)."""
+    truth = random_walk(80, 6)
+    est = moved(truth, noise=0.02)
+    divided = Trajectory(truth.times, truth.T_wc.copy())
+    divided.T_wc[:, :3] /= np.linalg.norm(truth.centres[-1] - truth.centres[0])
+    ref = evo.files.read_tum_trajectory_file(str(write(tmp_path / "ref.tum", divided)))
+    mine = evo.files.read_tum_trajectory_file(str(write(tmp_path / "est.tum", est)))
+    mine.align(ref, correct_scale=True)
+    ape = evo.metrics.APE(evo.metrics.PoseRelation.translation_part)
+    ape.process_data((ref, mine))
+    ours = score(est, truth, normalise="displacement")
+    assert ours.ate.rmse == pytest.approx(ape.get_statistic(evo.metrics.StatisticsType.rmse))
