@@ -21,7 +21,14 @@ from droidw.config.schema import DroidwConfig
 from droidw.errors import ConfigError, UsageError
 from droidw.plugin.registry import SLOTS, nearest
 
-__all__ = ["LISTED", "LoadedConfig", "Source", "load_config", "packaged_configs"]
+__all__ = [
+    "LISTED",
+    "LoadedConfig",
+    "Source",
+    "load_config",
+    "override_layers",
+    "packaged_configs",
+]
 
 LISTED = ("exporters", "observers")
 """Keys that map names of plugins to their options, any number at a time."""
@@ -78,6 +85,7 @@ def load_config(
     preset: str | None = None,
     overrides: Sequence[str] = (),
     values: Mapping[str, Any] | None = None,
+    layers: Sequence[tuple[str, Mapping[str, Any]]] = (),
 ) -> LoadedConfig:
     """Read and merge, without looking at any plugin.
 
@@ -87,6 +95,7 @@ def load_config(
         overrides: `key=value` as typed, the value read as YAML. Choices of a plugin take effect
             before the options in the same list, in whatever order they were typed.
         values: full key -> value, as flags such as `--stride` give them.
+        layers: where from -> tree as in a file; merged last, in this order.
     Raises:
         ConfigError: a file is missing, is no YAML, extends itself, or a slot holds no name.
         UsageError: an override is not `key=value`, or there is no such preset.
@@ -96,12 +105,22 @@ def load_config(
         merger.add_file(_preset_path(preset), ())
     for file in files:
         merger.add_file(Path(file), ())
-    source = Source(_COMMAND_LINE)
-    layers = [_nested(key.split("."), value) for key, value in (values or {}).items()]
-    layers += [_nested(*_override(text)) for text in overrides]
-    for layer in sorted(layers, key=lambda tree: not _chooses(tree)):
-        merger.merge(merger.data, layer, "", {"": source})
+    said = [_nested(key.split("."), value) for key, value in (values or {}).items()]
+    for where, layer in (*override_layers(overrides, said), *layers):
+        merger.merge(merger.data, layer, "", {"": Source(where)})
     return LoadedConfig(merger.data, merger.sources, tuple(merger.files), preset)
+
+
+def override_layers(
+    overrides: Sequence[str], trees: Sequence[Mapping[str, Any]] = ()
+) -> list[tuple[str, Mapping[str, Any]]]:
+    """Overrides as typed (`key=value`), and more trees, as layers in the order of merging.
+
+    Raises:
+        UsageError: an override is not `key=value`.
+    """
+    said = [*trees, *(_nested(*_override(text)) for text in overrides)]
+    return [(_COMMAND_LINE, tree) for tree in sorted(said, key=lambda tree: not _chooses(tree))]
 
 
 def packaged_configs() -> dict[str, Path]:
@@ -209,7 +228,7 @@ class _Merger:
             del self.sources[key]
 
 
-def _chooses(layer: _Tree) -> bool:
+def _chooses(layer: Mapping[str, Any]) -> bool:
     """Whether an override names a plugin, and so must come before that plugin's options."""
     slot, value = next(iter(layer.items()))
     return slot in SLOTS and (not isinstance(value, dict) or "name" in value)
