@@ -18,10 +18,10 @@ import yaml
 from droidw.config.check import check_keys, check_ranges, typed
 from droidw.config.load import LISTED, LoadedConfig, Source, load_config
 from droidw.config.schema import DroidwConfig
-from droidw.errors import ConfigError, DroidwError
+from droidw.errors import ConfigError, DroidwError, MissingRequirementError, PluginError
 from droidw.plugin.component import Component
 from droidw.plugin.manager import Plugins
-from droidw.plugin.registry import SLOTS, Entry, nearest
+from droidw.plugin.registry import SLOTS, Entry, PluginNotFound, nearest
 
 __all__ = ["COMPAT", "ResolvedConfig", "choose_preset", "resolve"]
 
@@ -29,6 +29,9 @@ COMPAT = ("droid-w",)
 """Published behaviours that `compat` may ask for."""
 
 _ON_DEVICE = ("features", "depth", "uncertainty", "ba", "correspondence")
+
+_MISSING = (PluginNotFound, MissingRequirementError, PluginError)
+"""What may be wrong with several parts at a time, and is then told of all."""
 
 Part = tuple[Component[Any], Any]
 
@@ -97,11 +100,18 @@ def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
                 )
             continue
         try:
-            part, origins[slot] = _part(plugins, slot, chosen.name, f"{slot}.name", loaded)
-        except DroidwError as error:
+            part, options, origins[slot] = _part(
+                plugins,
+                slot,
+                chosen.name,
+                f"{slot}.name",
+                chosen.options,
+                f"{slot}.options",
+                loaded,
+            )
+        except _MISSING as error:
             problems.append(error)
             continue
-        options = _options(part, chosen.options, f"{slot}.options", loaded)
         chosen.options = _plain(options)
         parts[slot] = (part, options)
     listed: dict[str, list[Part]] = {}
@@ -117,11 +127,12 @@ def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
                     f"{key}={{}} switches it on, {key}=null off",
                 )
             try:
-                part, origins[key] = _part(plugins, section[:-1], name, key, loaded)
-            except DroidwError as error:
+                part, options, origins[key] = _part(
+                    plugins, section[:-1], name, key, given, key, loaded
+                )
+            except _MISSING as error:
                 problems.append(error)
                 continue
-            options = _options(part, given, key, loaded)
             getattr(config, section)[name] = _plain(options)
             listed[section].append((part, options))
     if problems:
@@ -145,14 +156,19 @@ def choose_preset(plugins: Plugins) -> tuple[str, str]:
     Returns:
         The name of the preset, and a sentence that says why.
     """
-    data = load_config(preset="paper").data
+    loaded = load_config(preset="paper")
+    data = loaded.data
     missing = []
     for slot in SLOTS:
         name = data[slot]["name"]
         if slot == "reader" and name == "auto":
             continue
         registry = plugins.registry(slot)
-        status = registry.status(name) if name in registry else "not installed"
+        status = "not installed"
+        if name in registry:
+            component = registry.providers(name)[0].component
+            options = _options(component, data[slot]["options"], f"{slot}.options", loaded)
+            status = registry.status(name, options)
         if status != "ready":
             missing.append(f"{slot} '{name}' ({status})")
     if missing:
@@ -161,13 +177,24 @@ def choose_preset(plugins: Plugins) -> tuple[str, str]:
 
 
 def _part(
-    plugins: Plugins, kind: str, name: str, key: str, loaded: LoadedConfig
-) -> tuple[Component[Any], Entry]:
-    """The component of that name, ready to use; errors say the key and where it was written."""
+    plugins: Plugins,
+    kind: str,
+    name: str,
+    key: str,
+    given: Mapping[str, Any],
+    options_key: str,
+    loaded: LoadedConfig,
+) -> tuple[Component[Any], Any, Entry]:
+    """The component of that name, ready to use, and its options.
+
+    Which weights it needs may depend on the options. Errors say the key and where it was written.
+    """
     registry = plugins.registry(kind)
     try:
-        return registry.require(name), registry.entry(name)
-    except DroidwError as error:
+        entry = registry.entry(name)
+        options = _options(entry.component, given, options_key, loaded)
+        return registry.require(name, options), options, entry
+    except _MISSING as error:
         raise type(error)(f"{loaded.at(key)}: {error.message}", error.hint) from error
 
 

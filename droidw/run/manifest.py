@@ -11,8 +11,13 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 import droidw
+from droidw.errors import InputError
+from droidw.io.weights import fingerprint
+from droidw.plugin.weights import find_weights, weights_name
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from droidw.config.resolve import ResolvedConfig
     from droidw.geometry.camera import Camera
     from droidw.interfaces.datasets import FrameSource
@@ -47,17 +52,44 @@ def versions(device: torch.device) -> dict[str, str]:
     return found
 
 
-def describe_parts(resolved: ResolvedConfig) -> dict[str, dict[str, Any]]:
-    """Slot -> name, where it comes from, and its reference."""
-    described = {}
-    for slot, (component, _) in resolved.parts.items():
+def describe_parts(
+    resolved: ResolvedConfig, weights_dir: Path | None = None, parts: object = None
+) -> dict[str, dict[str, Any]]:
+    """Slot -> name, where it comes from, its reference, and its weights with their hashes.
+
+    Args:
+        resolved: the configuration.
+        weights_dir: where weights files lie.
+        parts: the built parts by slot as attributes; one that found weights of its own says
+            their hash as `weights_sha256`.
+    """
+    described: dict[str, dict[str, Any]] = {}
+    for slot, (component, options) in resolved.parts.items():
         entry = resolved.origins.get(slot)
         described[slot] = {
             "name": component.name,
             "from": entry.origin if entry else "",
             "reference": component.reference,
         }
+        weights = {}
+        for wanted in component.weights_for(options):
+            path = find_weights(weights_dir, wanted)
+            if path is not None:
+                weights[weights_name(wanted)] = {"file": path.name, "sha256": _hash(path)}
+        own = getattr(getattr(parts, slot, None), "weights_sha256", "")
+        if own and not weights:
+            weights["own"] = {"sha256": str(own)}
+        if weights:
+            described[slot]["weights"] = weights
     return described
+
+
+def _hash(path: Path) -> str:
+    """SHA-256 of a file; "" where it has changed meanwhile, which must not cost the results."""
+    try:
+        return fingerprint(path)
+    except (InputError, OSError):
+        return ""
 
 
 def peak_memory_mb() -> float:
@@ -113,13 +145,18 @@ def facts_of_time(
     }
 
 
-def facts_of_setup(resolved: ResolvedConfig, device: torch.device) -> dict[str, Any]:
-    """Configuration, parts and versions."""
+def facts_of_setup(
+    resolved: ResolvedConfig,
+    device: torch.device,
+    weights_dir: Path | None = None,
+    parts: object = None,
+) -> dict[str, Any]:
+    """Configuration, parts and versions; arguments as of `describe_parts`."""
     return {
         "preset": resolved.preset or "",
         "seed": resolved.config.seed,
         "device": str(device),
         "versions": versions(device),
-        "parts": describe_parts(resolved),
+        "parts": describe_parts(resolved, weights_dir, parts),
         "config_yaml": resolved.to_yaml(),
     }
