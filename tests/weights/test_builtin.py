@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 
 import pytest
 import torch
@@ -91,3 +92,9 @@ def test_a_published_droid_file_is_added_and_loaded_back(tmp_path):
     back = load_state(store.folder, "droid")
     assert len(back) == 102 and back["update.weight.2.weight"].shape[0] == 2
     assert sum(value.numel() for value in back.values()) == 4_002_565
+
+
+def test_the_page_names_every_file():
+    page = (Path(__file__).parents[2] / "docs" / "weights.md").read_text(encoding="utf-8")
+    for file in FILES:
+        assert f"| `{file.name}` |" in page and f"`{file.file}`" in page
