@@ -77,7 +77,11 @@ class EdgeUpdate:
 
 @runtime_checkable
 class EdgeSession(Protocol):
-    """The state of the edges of one factor graph."""
+    """The state of the edges of one factor graph.
+
+    A session for "global" may besides have `upsample(node, disp) -> Tensor | None`: the map
+    [h,w] of a source frame of the last update at the full size [H,W] of the picture.
+    """
 
     def update(self, request: EdgeRequest) -> EdgeUpdate:
         """One round: measure new edges, refine or re-use the old ones."""
@@ -104,7 +108,11 @@ class Correspondence(Protocol):
     offset: float
 
     def encode(self, frame: Frame, grid: Grid) -> Any:
-        """What is needed of every frame; opaque to the core, cheap to hold."""
+        """What is needed of every frame; opaque to the core, cheap to hold.
+
+        Raises:
+            InputError: pictures of this size cannot be taken; says which can.
+        """
         ...
 
     def context(self, payload: Any, frame: Frame, grid: Grid) -> Any:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from droidw.errors import InputError
 from droidw.geometry.camera import Grid
 from droidw.interfaces.correspondence import (
     Correspondence,
@@ -54,6 +55,8 @@ def correspondence(subject: Subject) -> None:
             )
         grid = Grid.of(rows, columns, part.stride, part.offset)
         label = f"pictures of {columns}x{rows}"
+        if (rows, columns) != _CROPS[0] and _refuses(part, frames[0], grid):
+            continue
         payloads = _encode(subject, part, frames, grid)
         update = _sessions(subject, part, payloads, grid, label)
         _accuracy(subject, scene, update, grid, label)
@@ -67,6 +70,15 @@ def correspondence(subject: Subject) -> None:
             f"two operators of one seed answer differently for {label}",
         )
         _motion(subject, part, payloads)
+
+
+def _refuses(part: Any, frame: Frame, grid: Grid) -> bool:
+    """Whether pictures of this size are refused in a sentence, as a network may do."""
+    try:
+        part.encode(frame, grid)
+    except InputError:
+        return True
+    return False
 
 
 def _encode(subject: Subject, part: Any, frames: list[Frame], grid: Grid) -> list[Any]:

@@ -164,7 +164,8 @@ def check_correspondence(
     also for no edges, known and new ones, and for every purpose; `sources` fit damping and upmask;
     `forget` ignores unknown ids and frees known ones; `accuracy`: on rendered pictures 3 frames
     apart the median error of confident cells is below 2 pixels; `motion` of a frame against
-    itself is nothing and grows with distance. Even and odd picture sizes.
+    itself is nothing and grows with distance. Even picture sizes, and odd ones too unless these
+    are refused with an `InputError`.
 
     Raises:
         AssertionError: a clause does not hold.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from droidw.errors import UsageError
+from droidw.errors import InputError, UsageError
 from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.interfaces.depth import DepthMap
 from droidw.interfaces.uncertainty import StoreField, UncertaintyReport
@@ -339,6 +339,30 @@ def reversed_answers(request, update):
 )
 def test_correspondence_faults_are_caught(clause, change):
     broken(clause, "correspondence", component(lambda: Wrapped(change)))
+
+
+class Choosy(Wrapped):
+    """Refuses pictures of which a side is no multiple of `multiple`, as a network may."""
+
+    multiple = 8
+
+    def __init__(self):
+        super().__init__(lambda request, update: update)
+        del self.encode
+
+    def encode(self, frame, grid):
+        if any(side % self.multiple for side in frame.image.shape[-2:]):
+            raise InputError("pictures of this size do not suit")
+        return self.inner.encode(frame, grid)
+
+
+class TooChoosy(Choosy):
+    multiple = 7
+
+
+def test_correspondence_may_refuse_odd_sizes_but_not_all():
+    conformance.check("correspondence", component(Choosy))
+    broken("errors", "correspondence", component(TooChoosy))
 
 
 SMALL = READER.options(frames=6, width=64, height=48)
