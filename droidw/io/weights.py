@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import pickle
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -129,10 +130,11 @@ def _read_torch(path: Path) -> object:
     import torch
 
     try:
-        # Mapped into memory: what stands beside the weights (states of an optimiser) costs none.
-        return torch.load(
-            path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
-        )
+        with _plain_numbers_of_numpy():
+            # Mapped into memory: what stands beside the weights (of an optimiser) costs none.
+            return torch.load(
+                path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path)
+            )
     except pickle.UnpicklingError as error:
         if "Unsupported" in str(error) or "GLOBAL" in str(error):
             raise InputError(
@@ -142,6 +144,29 @@ def _read_torch(path: Path) -> object:
         raise _broken(path, error) from error
     except (RuntimeError, EOFError, OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise _broken(path, error) from error
+
+
+@contextlib.contextmanager
+def _plain_numbers_of_numpy() -> Iterator[None]:
+    """Allow numbers of numpy in a checkpoint, which training leaves there: they are only data."""
+    import numpy as np
+    import torch
+
+    allow = getattr(torch.serialization, "safe_globals", None)  # not in torch 2.4
+    if allow is None:
+        yield
+        return
+    scalar = np.float64(0).__reduce__()[0]
+    kinds = (np.float64, np.float32, np.int64, np.int32, np.bool_)
+    with allow(
+        [
+            (scalar, "numpy.core.multiarray.scalar"),
+            (scalar, "numpy._core.multiarray.scalar"),
+            np.dtype,
+            *(type(np.dtype(kind)) for kind in kinds),
+        ]
+    ):
+        yield
 
 
 def _broken(path: Path, error: Exception) -> InputError:

@@ -9,6 +9,7 @@ import pickle
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -164,6 +165,13 @@ def test_a_pickle_never_runs_code(store, site, tmp_path, form):
     assert not mark.exists() and find(store.folder, "acme-small") is None
     pickle.loads(pickle.dumps(Evil(mark)))  # the trap does work
     assert mark.exists()
+
+
+def test_numbers_beside_the_weights_do_no_harm(store, tmp_path):
+    """A training run leaves its optimiser and figures of numpy in the same file."""
+    state = {"model_state_dict": weights(), "loss": np.float64(0.25), "step": np.int64(800_000)}
+    torch.save({**state, "optimizer": {"state": {0: {"exp_avg": torch.ones(4)}}}}, tmp_path / "x")
+    assert store.add(tmp_path / "x")[0].name == "acme-small"
 
 
 def test_a_file_is_recognised_by_its_tensors(store, tmp_path):
