@@ -18,6 +18,9 @@ class FeatureExtractor(Protocol):
 
     Attributes:
         dim: number of channels C; 0 for the extractor `none`.
+
+    An extractor may also have `dtype`, the type of what `extract` returns, torch.float32 or
+    torch.float16: keyframes then keep features in it. Without it they keep float32.
     """
 
     dim: int

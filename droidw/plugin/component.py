@@ -21,6 +21,8 @@ from droidw.plugin.weights import WeightsFile
 if TYPE_CHECKING:
     import torch
 
+    from droidw.geometry.camera import Camera
+
 T = TypeVar("T")
 
 __all__ = ["BuildContext", "Component", "NoOptions"]
@@ -41,6 +43,8 @@ class BuildContext:
         weights_dir: folder of downloaded weights, or None where none was set up.
         run_dir: the run folder, or None in tests; the only place where a component may write.
         compat: names of published behaviours asked for, such as "droid-w".
+        camera: of the raw pictures, or None where it is not known (frames carry their own
+            intrinsics, at working size).
     """
 
     device: torch.device
@@ -48,6 +52,7 @@ class BuildContext:
     weights_dir: Path | None = None
     run_dir: Path | None = None
     compat: frozenset[str] = frozenset()
+    camera: Camera | None = None
 
 
 @dataclass(frozen=True)

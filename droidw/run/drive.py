@@ -149,6 +149,7 @@ class _Run:
         if guessed:
             self.events.warn(f"camera: {self.said}")
         self.masks = open_masks(self.config.input, source)
+        self.context = replace(self.context, camera=camera)
         parts = self._build()
         threads = "threads" in self.resolved.parts["correspondence"][0].capabilities
         system = SlamSystem(
@@ -356,7 +357,7 @@ class _Run:
                 time.perf_counter() - self.started,
             ),
             "camera": self.said,
-            **facts_of_setup(self.resolved, self.device),
+            **facts_of_setup(self.resolved, self.device, self.context.weights_dir, system.parts),
             "note": self.note,
             "files": {
                 name: meaning

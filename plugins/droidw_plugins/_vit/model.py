@@ -174,7 +174,8 @@ class VisionTransformer(nn.Module):
         """
         kept = self._positions
         if kept is None or kept[0] != (height, width) or kept[1].device != self.pos_embed.device:
-            trained = self.pos_embed.detach().cpu().transpose(1, 2).unflatten(2, (GRID, GRID))
+            trained = self.pos_embed.detach().cpu().transpose(1, 2)
+            trained = trained.reshape(1, -1, GRID, GRID)
             found = resample_positions(trained, height, width, self.spec.resampling)
             kept = (height, width), found.flatten(2).transpose(1, 2).to(self.pos_embed.device)
             self._positions = kept

@@ -6,14 +6,17 @@ which FiT3D is published, and the one inside Metric3D. `canonical` brings all to
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from droidw.errors import InputError
+from droidw.io.weights import find, load_state, read_state
 from droidw.plugin.weights import WeightsFile
 from droidw_plugins._vit.layers import build
 from droidw_plugins._vit.model import GRID, SMALL, VisionTransformer, VitSpec
@@ -21,6 +24,7 @@ from droidw_plugins._weights import DINOV2_VITS14, DINOV2_VITS14_REG, FIT3D, FIT
 
 __all__ = [
     "FORMS",
+    "blaming",
     "canonical",
     "check_dinov2_vits14",
     "check_dinov2_vits14_reg",
@@ -29,6 +33,7 @@ __all__ = [
     "check_shapes",
     "floats",
     "load_transformer",
+    "read_published",
     "transformer_shapes",
 ]
 
@@ -89,6 +94,36 @@ def load_transformer(
     with torch.device("meta"):
         network = VisionTransformer(FORMS[record.name][0])
     return build(network, canonical(checked), device, dtype)
+
+
+def read_published(
+    record: WeightsFile, given: str | None, folder: Path | None
+) -> tuple[Path, dict[str, Tensor]]:
+    """Find and read a checkpoint.
+
+    Args:
+        record: of the weights.
+        given: path of a file that is to be used instead, or None.
+        folder: where weights are kept.
+    Returns:
+        Its path, and its tensors as they are stored.
+    Raises:
+        MissingRequirementError: it is not in the folder.
+        InputError: it cannot be read.
+    """
+    if given:
+        path = Path(given).expanduser()
+        return path, read_state(path)
+    return find(folder, record) or Path(record.file), load_state(folder, record)
+
+
+@contextmanager
+def blaming(path: Path) -> Iterator[None]:
+    """Inside, an `InputError` about a checkpoint says which file it is about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error.message}", error.hint) from error
 
 
 def check_shapes(

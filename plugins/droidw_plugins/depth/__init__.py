@@ -17,7 +17,8 @@ __all__ = ["droidw_depth_priors"]
 @hookimpl
 def droidw_depth_priors() -> Iterable[Component[DepthPrior]]:
     """Light records only: the factory of each imports what it needs."""
-    from droidw_plugins.depth import file, none
+    from droidw_plugins.depth import file, metric3d, none
 
     yield file.COMPONENT
+    yield metric3d.COMPONENT
     yield none.COMPONENT

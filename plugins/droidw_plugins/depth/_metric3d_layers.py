@@ -48,7 +48,8 @@ class _ReadOut(nn.Module):
     def forward(self, tokens: Tensor, height: int, width: int) -> Tensor:
         patches = self.project_patch(tokens[:, self.prefix :])
         whole = self.project_learn(tokens[:, : self.prefix].flatten(1))
-        return F.gelu(patches + whole[:, None]).transpose(1, 2).unflatten(2, (height, width))
+        found = F.gelu(patches + whole[:, None]).transpose(1, 2)
+        return found.reshape(len(tokens), -1, height, width)
 
 
 class _Read(nn.Module):
@@ -200,9 +201,9 @@ class _Gru(nn.Module):
     def forward(self, h: Tensor, context: tuple[Tensor, ...], *inputs: Tensor) -> Tensor:
         x = torch.cat(inputs, 1)
         both = torch.cat([h, x], 1)
-        z = (self.convz(both) + context[0]).sigmoid()
-        r = (self.convr(both) + context[1]).sigmoid()
-        q = (self.convq(torch.cat([r * h, x], 1)) + context[2]).tanh()
+        z: Tensor = (self.convz(both) + context[0]).sigmoid()
+        r: Tensor = (self.convr(both) + context[1]).sigmoid()
+        q: Tensor = (self.convq(torch.cat([r * h, x], 1)) + context[2]).tanh()
         return (1 - z) * h + z * q
 
 

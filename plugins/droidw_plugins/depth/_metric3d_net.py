@@ -151,7 +151,8 @@ class _Decoder(nn.Module):
 
     def weigh(self, hidden: list[Tensor]) -> Tensor:
         """Weights [B,144,a,b] of neighbours for the enlargement, before softmax, float32."""
-        return 0.25 * self.update_block.mask(hidden[0]).float()
+        found: Tensor = self.update_block.mask(hidden[0])
+        return 0.25 * found.float()
 
     def forward(self, tokens: Tensor, height: int, width: int) -> Estimate:
         """The estimate from tokens [B,prefix+gh*gw,D]."""

@@ -43,6 +43,7 @@ class CnnFeatures:
         context: device of the run.
     Attributes:
         dim: channels of the result.
+        dtype: of the result, in which keyframes keep it.
         weights_sha256: of the weights file, for the manifest.
     Raises:
         ConfigError: taps or their weights make no sense.
@@ -77,6 +78,7 @@ class CnnFeatures:
         if options.calibration == "picture" and 0 < options.channels < rows + extra:
             self._rows = rows = max(options.channels - extra, 1)
         self.dim = rows + extra
+        self.dtype: torch.dtype = getattr(torch, options.dtype)
         self._fixed: Calibration | None = None
         self._default = from_weights(
             self._trunk.statistics,
@@ -111,7 +113,7 @@ class CnnFeatures:
                     options.constant,
                     options.length,
                 )
-        return calibration(torch.cat(taps)).to(getattr(torch, self._options.dtype))
+        return calibration(torch.cat(taps)).to(self.dtype)
 
     def state_dict(self) -> dict[str, Any]:
         """The calibration taken from a picture; empty before there was one."""

@@ -12,9 +12,6 @@ __all__ = ["PatchOptions"]
 class PatchOptions:
     """Options of `fit3d` and `dinov2`; the defaults are what the published system does."""
 
-    registers: bool = field(
-        default=True, metadata={"help": "the network with four register tokens, or that without"}
-    )
     long_side: int = field(
         default=0,
         metadata={

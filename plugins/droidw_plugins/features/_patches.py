@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,12 +10,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from droidw.errors import InputError
-from droidw.io.weights import load_state, read_state
+from droidw.io.weights import fingerprint
 from droidw.plugin.component import BuildContext
 from droidw.plugin.weights import WeightsFile
 from droidw_plugins._vit.layers import choose_dtype, exact
 from droidw_plugins._vit.model import PATCH
-from droidw_plugins._vit.published import load_transformer
+from droidw_plugins._vit.published import blaming, load_transformer, read_published
 from droidw_plugins.features._calibration import Calibration, from_picture, is_blank
 from droidw_plugins.features._efficientnet import ChannelStatistics
 from droidw_plugins.features._patch_options import PatchOptions
@@ -43,6 +42,7 @@ class PatchFeatures:
     Attributes:
         dim: channels of the result.
         dtype: of the result, in which the keyframe store keeps it.
+        weights_sha256: of a checkpoint that the options name, for the manifest; else "".
     Raises:
         ConfigError: float16 products are asked for on a CPU.
         MissingRequirementError: the weights are missing.
@@ -54,11 +54,10 @@ class PatchFeatures:
         self._product = choose_dtype(
             options.precision, context.device, "features.options.precision"
         )
-        if options.weights:
-            state = read_state(Path(options.weights).expanduser())
-        else:
-            state = load_state(context.weights_dir, record)
-        self._network = load_transformer(record, state, context.device, self._product)
+        path, state = read_published(record, options.weights, context.weights_dir)
+        with blaming(path):
+            self._network = load_transformer(record, state, context.device, self._product)
+        self.weights_sha256 = fingerprint(path) if options.weights else ""
         self._options = options
         self._mean = torch.tensor(_MEAN, device=context.device)[:, None, None]
         self._std = torch.tensor(_STD, device=context.device)[:, None, None]
@@ -83,13 +82,13 @@ class PatchFeatures:
     @torch.no_grad()
     def patches(self, image: Tensor) -> Tensor:
         """The map of patch tokens [C,gh,gw] float32 of one image [3,H,W] in [0,1], RGB."""
-        height, width = patch_grid(*image.shape[-2:], self._options.long_side)
-        tokens = self.tokens(self.network_input(image))
-        return tokens[0, self._network.spec.prefix :].T.unflatten(1, (height, width))
+        x = self.network_input(image)
+        tokens = self.tokens(x)[0, self._network.spec.prefix :]
+        return tokens.T.reshape(-1, x.shape[2] // PATCH, x.shape[3] // PATCH)
 
     def network_input(self, image: Tensor) -> Tensor:
         """What the network is shown, [1,3,14*gh,14*gw]: normalised first, then resized."""
-        height, width = patch_grid(*image.shape[-2:], self._options.long_side)
+        height, width = patch_grid(image.shape[-2], image.shape[-1], self._options.long_side)
         x = ((image.to(self._device) - self._mean) / self._std)[None]
         size = (height * PATCH, width * PATCH)
         if tuple(image.shape[-2:]) == size:

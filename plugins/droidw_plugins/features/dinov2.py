@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
 
 from droidw.plugin.component import BuildContext, Component
 from droidw_plugins._weights import DINOV2_VITS14, DINOV2_VITS14_REG
@@ -20,9 +20,13 @@ __all__ = ["COMPONENT", "Dinov2Options"]
 class Dinov2Options(PatchOptions):
     """Options of the extractor `dinov2`."""
 
+    variant: Literal["vits14-reg", "vits14"] = field(
+        default="vits14-reg", metadata={"help": "ViT-S/14 with four register tokens or without"}
+    )
+
 
 def _record(options: Dinov2Options) -> WeightsFile:
-    return DINOV2_VITS14_REG if options.registers else DINOV2_VITS14
+    return DINOV2_VITS14_REG if options.variant == "vits14-reg" else DINOV2_VITS14
 
 
 def _weights(options: Dinov2Options) -> tuple[WeightsFile, ...]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
 
 from droidw.plugin.component import BuildContext, Component
 from droidw_plugins._weights import FIT3D, FIT3D_PLAIN
@@ -20,9 +20,16 @@ __all__ = ["COMPONENT", "Fit3dOptions"]
 class Fit3dOptions(PatchOptions):
     """Options of the extractor `fit3d`."""
 
+    variant: Literal["reg-small", "small"] = field(
+        default="reg-small",
+        metadata={
+            "help": "dinov2_reg_small_fine, which has four register tokens, or dinov2_small_fine"
+        },
+    )
+
 
 def _record(options: Fit3dOptions) -> WeightsFile:
-    return FIT3D if options.registers else FIT3D_PLAIN
+    return FIT3D if options.variant == "reg-small" else FIT3D_PLAIN
 
 
 def _weights(options: Fit3dOptions) -> tuple[WeightsFile, ...]:
