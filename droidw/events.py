@@ -63,7 +63,7 @@ class KeyframeAdded(Event):
 
 @dataclass(frozen=True)
 class KeyframeRemoved(Event):
-    """The newest keyframe added nothing and was dropped."""
+    """A keyframe added nothing and was dropped: the newest, or one shortly before it."""
 
     keyframe: int
     index: int

@@ -121,8 +121,16 @@ class FrontendConfig:
     nms: int = opt(2, "suppression radius around existing edges", ge=0)
     max_factors: int = opt(75, "active edges at most", ge=4)
     max_age: int = opt(12, "updates after which an edge is retired", ge=1)
-    predict: Literal["velocity", "hold"] = opt(
-        "velocity", "velocity: go on with the last motion and depth; hold: last pose, mean depth"
+    predict: Literal["velocity", "hold", "damped"] = opt(
+        "velocity",
+        "velocity: go on with the last motion and depth; hold: last pose, mean depth; "
+        "damped: half of the last motion, median depth",
+    )
+    mirror: bool = opt(True, "at initialisation, try the scene turned inside out as well")
+    redundant: Literal["newest", "middle"] = opt(
+        "newest",
+        "which keyframe is dropped where too little moved: the newest, if near to the one before; "
+        "middle: the last but two, if its neighbours are nearer than twice the threshold",
     )
 
 
@@ -135,6 +143,11 @@ class BackendConfig:
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)
     nms: int = opt(3, "suppression radius around chosen edges", ge=0)
+    nms_shape: Literal["square", "diamond"] = opt(
+        "square",
+        "what a chosen edge suppresses; diamond: as in the window, little near the diagonal",
+    )
+    normalize: bool = opt(False, "bring the mean disparity to 1 before each pass")
     factors_per_keyframe: int = opt(10, "directed edges per keyframe at most", ge=2)
 
 

@@ -78,6 +78,17 @@ class FactorGraph:
         rows = sorted(self.select(), key=lambda row: (-self.age[row], row))
         return rows[: max(0, len(rows) - keep)]
 
+    def oldest_as_published(self, room: int) -> list[int]:
+        """Rows of as many active edges as there are beyond `room`, by the published rule.
+
+        Meant are the oldest, and it is them where edges are stored in the order of their age. In
+        general the rule compares an edge's place in storage with its rank (REFERENCE 5.2); it is
+        used under `compat: [droid-w]` alone.
+        """
+        rows = self.select()
+        by_age = sorted(range(len(rows)), key=lambda k: self.age[rows[k]])
+        return [row for row, rank in zip(rows, by_age, strict=True) if rank >= room]
+
     def drop(self, rows: Sequence[int]) -> list[int]:
         """Delete edges altogether; returns their ids."""
         doomed = set(rows)

@@ -27,6 +27,7 @@ class KeyframeInfo:
         index, time, name: of its frame.
         image: [H,W,3] uint8 RGB at working size.
         payload: what the correspondence op keeps; opaque.
+        disp_full: [H,W] float32, or None where correspondence does not enlarge maps itself.
     """
 
     index: int
@@ -34,6 +35,7 @@ class KeyframeInfo:
     name: str
     image: npt.NDArray[np.uint8]
     payload: Any
+    disp_full: npt.NDArray[np.float32] | None = None
 
 
 class KeyframeStore:

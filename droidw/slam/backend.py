@@ -10,10 +10,13 @@ import torch
 
 from droidw.geometry.projective import frame_distance
 from droidw.graph.factors import FactorGraph
-from droidw.graph.proximity import backend_edges
+from droidw.graph.proximity import backend_edges, frontend_edges
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from droidw.config.schema import DroidwConfig
+    from droidw.interfaces.correspondence import EdgeSession
     from droidw.slam.optimise import Optimiser
 
 __all__ = ["Backend"]
@@ -43,20 +46,40 @@ class Backend:
         phase = self.config.schedule["global"]
         total = sum(options.passes)
         done = edges = 0
-        for updates in options.passes:
+        for number, updates in enumerate(options.passes):
+            if options.normalize:
+                mean = store.disps.mean()
+                store.disps.div_(mean)
+                store.T_cw[:, :3].mul_(mean)
             graph = FactorGraph(store.grid.height, store.grid.width, store.device)
             graph.add(self._edges())
             if len(graph) < 3:
                 return 0
             session = self.optimiser.parts.correspondence.session("global")
+            shown = store.disps
             for _ in range(updates):
+                if "droid-w" in self.config.compat:
+                    # as published: enlarged before the bundle adjustment of the same step
+                    shown = store.disps.clone()
                 self.optimiser.update(
                     graph, session, phase, self.config.global_solver, first_free=1
                 )
                 done += 1
                 tell(done, total)
             edges = len(graph)
+            if number == len(options.passes) - 1:
+                self._upsample(session, shown)
         return edges
+
+    def _upsample(self, session: EdgeSession, disps: Tensor) -> None:
+        """Keep full-size maps where correspondence can make them."""
+        upsample = getattr(session, "upsample", None)
+        if upsample is None:
+            return
+        for node, info in enumerate(self.optimiser.store.infos):
+            fine = upsample(node, disps[node])
+            if fine is not None:
+                info.disp_full = fine.float().cpu().numpy()
 
     def _edges(self) -> list[tuple[int, int]]:
         store, options = self.optimiser.store, self.config.backend
@@ -77,6 +100,17 @@ class Backend:
             )
         distance = np.full((count, count), np.inf)
         distance[ii.numpy(), jj.numpy()] = torch.cat(near).double().numpy()
+        if options.nms_shape == "diamond":
+            return frontend_edges(
+                distance,
+                0,
+                0,
+                (),
+                radius=options.radius,
+                nms=options.nms,
+                threshold=options.threshold,
+                max_factors=options.factors_per_keyframe * count,
+            )
         return backend_edges(
             distance,
             radius=options.radius,

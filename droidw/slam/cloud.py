@@ -23,20 +23,29 @@ _REACH = 3
 
 
 def consistent_depth(
-    store: KeyframeStore, relative_threshold: float, min_views: int, min_disp: float
+    store: KeyframeStore,
+    relative_threshold: float,
+    min_views: int,
+    min_disp: float,
+    published: bool = False,
 ) -> Tensor:
     """Cells whose depth at least `min_views` neighbouring keyframes confirm, [N,h,w] bool.
 
     A neighbour confirms a cell if the depth that the cell would have there and the depth that
     the neighbour has at one of the four cells around it differ by less than
     `relative_threshold`, as a share of the depth.
+
+    Args:
+        published: compare with keyframes 3, 4 and 5 ahead instead of 1, 2 and 3, a slip of the
+            published code (REFERENCE 5.9), under `compat: [droid-w]`.
     """
     count = len(store)
     height, width = store.grid.height, store.grid.width
     views = torch.zeros(count, height, width, dtype=torch.int64, device=store.device)
-    for gap in range(-_REACH, _REACH + 1):
+    ahead = range(_REACH, 2 * _REACH) if published else range(1, _REACH + 1)
+    for gap in (*range(-_REACH, 0), *ahead):
         first, last = max(0, -gap), min(count, count - gap)
-        if gap == 0 or last <= first:
+        if last <= first:
             continue
         ii = torch.arange(first, last, device=store.device)
         jj = ii + gap

@@ -56,7 +56,8 @@ class Filler:
         if before != after:
             share = (time - self._times[before]) / (self._times[after] - self._times[before])
             return interpolate(T_cw[before], T_cw[after], share)
-        if before == 0 or time <= self._times[before]:
+        hold = self.config.frontend.predict == "hold"
+        if before == 0 or hold or time <= self._times[before]:
             return T_cw[before]
         span = self._times[before] - self._times[before - 1]
         ahead = min((time - self._times[before]) / span, 1.0)
@@ -139,6 +140,6 @@ class Filler:
 
     def _sources(self, time: float) -> list[int]:
         before, after = self.neighbours(time)
-        if before == after and before > 0:
+        if before == after and before > 0 and self.config.frontend.predict != "hold":
             return [before - 1, before]
         return [before, after]

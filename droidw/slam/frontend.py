@@ -41,21 +41,24 @@ class Frontend:
         self.session = optimiser.parts.correspondence.session("window")
         self.initialised = False
         self._drops = 0
+        # Maps whose mean depth the next keyframe starts from, with `predict: hold`.
+        self._recent = 1
+        self._published = "droid-w" in config.compat
 
-    def grow(self, forced: bool = False, last: bool = False) -> bool:
+    def grow(self, forced: bool = False, last: bool = False) -> int | None:
         """Deal with the keyframe just appended to the store.
 
         Args:
             forced: the keyframe was forced by a frame count and may not be dropped.
             last: no further frame follows, so that initialisation cannot wait.
         Returns:
-            Whether the keyframe was dropped again.
+            The number of the keyframe that was dropped for it, or None.
         """
         if self.initialised:
             return self._window(forced)
         if len(self.store) >= self.options.warmup or (last and len(self.store) >= 2):
             self.initialise()
-        return False
+        return None
 
     def initialise(self) -> None:
         """Bundle adjustment of all keyframes so far, from scratch."""
@@ -63,13 +66,22 @@ class Frontend:
         schedule, options = self.config.schedule, self.options
         self.graph.add(neighbour_edges(count, 3))
         self._updates("init_blind", first_free=1, informed=False)
-        self._try_reversed()
+        if options.mirror:
+            self._try_reversed()
         for phase in ("init", "init_again"):
-            if schedule[phase].updates:
+            updates = schedule[phase].updates
+            if updates:
                 self._propose(0, 0, options.init_beta, nms=2)
                 self._updates(phase, first_free=1)
-        self._retire([r for r in self.graph.select() if self.graph.ii[r] < count - 4])
+            if phase == "init_again":
+                self.graph.grow_older(self.graph.select(), -updates)
+            self._retire([r for r in self.graph.select() if self.graph.ii[r] < count - 4])
+        self._recent = 4
         self.initialised = True
+
+    def release(self) -> None:
+        """Drop what correspondence holds of the window; nothing can be grown afterwards."""
+        self.session.forget(list(self.graph.ids))
 
     def _try_reversed(self) -> None:
         """Leave the mirrored solution if that is where the first keyframes have converged to.
@@ -116,28 +128,42 @@ class Frontend:
                 informed=informed,
             )
 
-    def _window(self, forced: bool) -> bool:
+    def _window(self, forced: bool) -> int | None:
         options, graph, store = self.options, self.graph, self.store
         count = len(store)
+        self._recent = 1
         self._retire([r for r in graph.select() if graph.age[r] > options.max_age])
-        self._propose(count - 5, max(count - options.window, 0), options.beta, nms=options.nms)
-        self._retire(graph.oldest(options.max_factors))
+        self._propose(
+            count - 5, max(count - options.window, 0), options.beta, nms=options.nms, retire=True
+        )
         graph.drop_before(max(0, count - 2 * options.window))
         self._updates("window", self._first_free())
-        if not forced and self._drops < _MOST_DROPS and self._near():
+        redundant = None if forced else self._redundant()
+        if redundant is not None:
             self._drops += 1
-            self._remove(count - 1)
-            return True
+            self._remove(redundant)
+            return redundant
         self._drops = 0
         self._updates("window_kept", self._first_free())
-        return False
+        return None
 
-    def _near(self) -> bool:
-        """Whether the newest keyframe shows nothing that its predecessor does not."""
-        count = len(self.store)
-        pair = torch.tensor([count - 2]), torch.tensor([count - 1])
-        moved = self._distance(*pair, self.options.beta)
-        return bool(moved[0] < self.options.keyframe_threshold)
+    def _redundant(self) -> int | None:
+        """The keyframe that shows nothing that its neighbours do not, or None."""
+        count, options = len(self.store), self.options
+        if options.redundant == "middle":
+            if count < 5:
+                return None
+            near = self._between(count - 4, count - 2) < 2 * options.keyframe_threshold
+            return count - 3 if near else None
+        if self._drops >= _MOST_DROPS:
+            return None
+        near = self._between(count - 2, count - 1) < options.keyframe_threshold
+        return count - 1 if near else None
+
+    def _between(self, i: int, j: int) -> float:
+        """Frame distance of two keyframes."""
+        pair = torch.tensor([i]), torch.tensor([j])
+        return float(self._distance(*pair, self.options.beta)[0])
 
     def _first_free(self) -> int:
         """The oldest source of an active edge stays; everything after it is free."""
@@ -158,8 +184,13 @@ class Frontend:
             store.T_cw, store.disps, store.intrinsics, ii.to(device), jj.to(device), beta
         )
 
-    def _propose(self, first_i: int, first_j: int, beta: float, nms: int) -> None:
-        """Add the edges that frame distance suggests among the newest keyframes."""
+    def _propose(
+        self, first_i: int, first_j: int, beta: float, nms: int, retire: bool = False
+    ) -> None:
+        """Add the edges that frame distance suggests among the newest keyframes.
+
+        With `retire`, as many of the oldest are retired as are too many then.
+        """
         count = len(self.store)
         first_i = max(0, first_i)
         rows = torch.arange(first_i, count)
@@ -180,7 +211,14 @@ class Frontend:
             threshold=self.options.threshold,
             max_factors=self.options.max_factors,
         )
+        if retire and self._published:
+            new = len(set(edges) - set(self.graph.pairs))
+            if len(self.graph.select()) + new > self.options.max_factors:
+                room = self.options.max_factors - new
+                self._retire(self.graph.oldest_as_published(room))
         self.graph.add(edges)
+        if retire:
+            self._retire(self.graph.oldest(self.options.max_factors))
 
     def guess(self, time: float) -> tuple[torch.Tensor, torch.Tensor]:
         """Pose [7] and disparity [h,w] to start a keyframe at `time` from.
@@ -194,8 +232,12 @@ class Frontend:
             return identity, store.disps.new_ones(store.grid.height, store.grid.width)
         last = store.T_cw[count - 1]
         if self.options.predict == "hold" or count < 2:
-            plane = store.disps[count - 1].mean().expand(store.grid.height, store.grid.width)
-            return last.clone(), plane.clone()
+            mean = store.disps[max(0, count - self._recent) :].mean()
+            return last.clone(), mean.expand(store.grid.height, store.grid.width).clone()
+        if self.options.predict == "damped":
+            median = store.disps[max(0, count - 3) :].median()
+            plane = median.expand(store.grid.height, store.grid.width).clone()
+            return mul(exp(0.5 * log(mul(last, inv(store.T_cw[count - 2])))), last), plane
         times = store.times()
         span = times[-1] - times[-2]
         ahead = min(max((time - times[-1]) / span, 0.0), 2.0) if span > 0 else 0.0

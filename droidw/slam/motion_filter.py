@@ -32,7 +32,7 @@ class Verdict:
 
     Attributes:
         keep: make it a keyframe.
-        forced: kept for its distance in frames, not for its motion.
+        forced: `force_every` frames have passed since the last keyframe; it is to stay.
         motion: measured against the reference; None for the first frame.
     """
 
@@ -63,7 +63,7 @@ class MotionFilter:
         self._options = options
         self._pool = pool
         self._reference: Encoded | None = None
-        self._last_index = 0
+        self._last_index: int | None = None
         self._lost = 0
         self._ahead: dict[tuple[int, int], Future[Motion]] = {}
 
@@ -74,7 +74,8 @@ class MotionFilter:
             return Verdict(keep=True, forced=False, motion=None)
         motion = self._measure(self._reference, current)
         options = self._options
-        gap = current.frame.index - self._last_index
+        last = self._reference.frame.index if self._last_index is None else self._last_index
+        gap = current.frame.index - last
         forced = options.force_every > 0 and gap >= options.force_every
         keep = motion.flow > options.threshold
         if motion.matched < options.min_matched and motion.matched >= options.lost_below:
@@ -87,7 +88,11 @@ class MotionFilter:
             self._lost = 0
         if keep or forced:
             self._accept(current)
-        return Verdict(keep=keep or forced, forced=forced and not keep, motion=motion)
+        return Verdict(keep=keep or forced, forced=forced, motion=motion)
+
+    def kept(self, index: int) -> None:
+        """Frame `index` has become a keyframe for good: frames are counted from it."""
+        self._last_index = index
 
     def expect(self, ahead: Iterable[Encoded]) -> None:
         """Start measuring these frames against the reference, if there are threads for it."""
@@ -103,7 +108,6 @@ class MotionFilter:
 
     def _accept(self, current: Encoded) -> None:
         self._reference = current
-        self._last_index = current.frame.index
         self._lost = 0
         for future in self._ahead.values():
             future.cancel()

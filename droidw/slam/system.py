@@ -86,7 +86,12 @@ class SlamSystem:
                 "at least 3 cells each way are needed; enlarge camera.long_side",
             )
         self.store = KeyframeStore(
-            self.grid, camera.intrinsics(), parts.features.dim, parts.uncertainty.fields, device
+            self.grid,
+            camera.intrinsics(),
+            parts.features.dim,
+            parts.uncertainty.fields,
+            device,
+            getattr(parts.features, "dtype", torch.float32),
         )
         self.optimiser = Optimiser(self.store, parts, config.weighting, self.clock)
         self.frontend = Frontend(self.optimiser, config)
@@ -154,10 +159,13 @@ class SlamSystem:
         number = self._append(current)
         self.events.emit(KeyframeAdded(number, current.frame.index))
         with self.clock("frontend"):
+            infos = list(self.store.infos)
             dropped = self.frontend.grow(forced)
-        if dropped:
-            self.events.emit(KeyframeRemoved(number, current.frame.index))
-        return not dropped
+        if dropped is not None:
+            self.events.emit(KeyframeRemoved(dropped, infos[dropped].index))
+        if dropped != number:
+            self._filter.kept(current.frame.index)
+        return dropped != number
 
     def _append(self, current: Encoded) -> int:
         frame, parts, store = current.frame, self.parts, self.store
@@ -206,6 +214,7 @@ class SlamSystem:
         if not self.frontend.initialised and len(self.store) >= 2:
             with self.clock("frontend"):
                 self.frontend.initialise()
+        self.frontend.release()
         found = diagnose(
             self.store, self._moved, self._matched, self.config.motion_filter.lost_below
         )
@@ -283,7 +292,11 @@ class SlamSystem:
         if len(store) == 0:
             return (), static_cloud(store, torch.zeros(0), torch.zeros(0), cloud)
         valid = consistent_depth(
-            store, cloud.relative_threshold, cloud.min_views, self.config.weighting.min_disp
+            store,
+            cloud.relative_threshold,
+            cloud.min_views,
+            self.config.weighting.min_disp,
+            published="droid-w" in self.config.compat,
         )
         weight = self.optimiser.gates()
         T_wc = inv(store.T_cw.double()).cpu().numpy()
@@ -300,6 +313,7 @@ class SlamSystem:
                 depth_valid=valid[n].cpu().numpy(),
                 uncertainty=store["uncertainty"][n].float().cpu().numpy().copy(),
                 weight=weight[n].float().cpu().numpy().copy(),
+                disp_full=info.disp_full,
             )
             for n, info in enumerate(store.infos)
         )
