@@ -51,6 +51,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder with a mask per picture, of the same name or in the same order: what is not "
         "black there is ignored",
     )
+    parser.add_argument(
+        "--data",
+        metavar="DIR",
+        help="folder of datasets for SOURCE like bonn:balloon (DROIDW_DATA)",
+    )
     parser.add_argument("--device", metavar="D", help="auto, cpu, cuda, cuda:N")
     parser.add_argument("--seed", metavar="N", help="seed of everything that draws numbers")
     add_plugin_arguments(parser)
@@ -87,8 +92,11 @@ def main(args: argparse.Namespace) -> int:
     ]
     if args.quiet:
         overrides.append("observers.progress.enabled=false")
+    plugins = plugins_from(args)
+    if args.data is not None:
+        plugins.data_dir = Path(args.data).expanduser()
     result = execute(
-        plugins_from(args),
+        plugins,
         [Path(f) for f in args.config],
         args.preset,
         flags + overrides,

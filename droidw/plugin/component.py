@@ -41,6 +41,8 @@ class BuildContext:
         device: where tensors of the run live.
         seed: seed of the run; a component that draws numbers makes its own generator from it.
         weights_dir: folder of downloaded weights, or None where none was set up.
+        data_dir: folder of datasets that readers know by name (`bonn:balloon`), or None for the
+            usual one (`droidw.io.dataset_tables.data_root`).
         run_dir: the run folder, or None in tests; the only place where a component may write.
         compat: names of published behaviours asked for, such as "droid-w".
         camera: of the raw pictures, or None where it is not known (frames carry their own
@@ -50,6 +52,7 @@ class BuildContext:
     device: torch.device
     seed: int = 0
     weights_dir: Path | None = None
+    data_dir: Path | None = None
     run_dir: Path | None = None
     compat: frozenset[str] = frozenset()
     camera: Camera | None = None

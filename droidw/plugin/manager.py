@@ -65,11 +65,13 @@ class Plugins:
     Attributes:
         failures: what could not be loaded and why, in the order of loading.
         weights_dir: folder in which weights files are looked for.
+        data_dir: folder of datasets for the readers, or None for the usual one.
     """
 
     def __init__(self, environ: Mapping[str, str] = os.environ) -> None:
         self.failures: list[Failure] = []
         self.weights_dir = _weights_dir(environ)
+        self.data_dir: Path | None = None
         self._blocked = frozenset(_split(environ.get(DISABLE_VARIABLE, "")))
         self._entries: list[Entry] = []
         self._met: set[str] = set()

@@ -108,6 +108,7 @@ class _Run:
             device=device,
             seed=self.config.seed,
             weights_dir=plugins.weights_dir,
+            data_dir=plugins.data_dir,
             run_dir=run_dir,
             compat=frozenset(self.config.compat),
         )
