@@ -147,7 +147,9 @@ class BackendConfig:
         "square",
         "what a chosen edge suppresses; diamond: as in the window, little near the diagonal",
     )
-    normalize: bool = opt(False, "bring the mean disparity to 1 before each pass")
+    normalize: bool = opt(
+        False, "bring the mean disparity to 1 before each pass, where no depth prior is"
+    )
     factors_per_keyframe: int = opt(10, "directed edges per keyframe at most", ge=2)
 
 

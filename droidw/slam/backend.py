@@ -47,7 +47,7 @@ class Backend:
         total = sum(options.passes)
         done = edges = 0
         for number, updates in enumerate(options.passes):
-            if options.normalize:
+            if options.normalize and not bool(store["prior"].any()):
                 mean = store.disps.mean()
                 store.disps.div_(mean)
                 store.T_cw[:, :3].mul_(mean)

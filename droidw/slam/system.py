@@ -79,6 +79,9 @@ class SlamSystem:
         self.clock = Stopwatch(wait)
         op = parts.correspondence
         self.grid = Grid.of(camera.height, camera.width, op.stride, op.offset)
+        # The published code takes depth and features from pixel 8 x + 3, but its rays from 8 x.
+        shifted = "droid-w" in config.compat and (op.stride, op.offset) == (8, 0)
+        self._picked = replace(self.grid, offset=3.0) if shifted else self.grid
         if min(self.grid.height, self.grid.width) < 3:
             raise InputError(
                 f"pictures of {camera.width}x{camera.height} px leave a grid of "
@@ -172,7 +175,7 @@ class SlamSystem:
         image = frame.image.to(store.device)
         pose, disp = self.frontend.guess(frame.time)
         with self.clock("features"):
-            features = parts.features.extract(image, self.grid)
+            features = parts.features.extract(image, self._picked)
         with self.clock("depth prior"):
             prior = self._prior(frame)
         payload = parts.correspondence.context(current.payload, frame, self.grid)
@@ -198,7 +201,7 @@ class SlamSystem:
         prediction = self.parts.depth.predict(frame)
         if prediction is None:
             return blank
-        depth = self.grid.sample(prediction.depth.to(self.store.device), mode="nearest")
+        depth = self._picked.sample(prediction.depth.to(self.store.device), mode="nearest")
         known = torch.isfinite(depth) & (depth > 0)
         return torch.where(known, 1.0 / depth.clamp_min(1e-6), blank)
 

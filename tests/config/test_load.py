@@ -179,7 +179,7 @@ def test_overrides_that_are_refused():
 
 def test_unknown_preset():
     assert refusal(preset="papr", error=UsageError) == (
-        "--preset: no preset is called 'papr'\n  did you mean 'paper'?   presets: cpu, paper, auto"
+        "--preset: no preset is called 'papr'\n  did you mean 'paper'?   presets: cpu, droid-slam, paper, auto"
     )
 
 
