@@ -61,7 +61,7 @@ def describe_parts(
         resolved: the configuration.
         weights_dir: where weights files lie.
         parts: the built parts by slot as attributes; one that found weights of its own says
-            their hash as `weights_sha256`.
+            their hash as `weights_sha256`, and one that chose among others says it as `chosen`.
     """
     described: dict[str, dict[str, Any]] = {}
     for slot, (component, options) in resolved.parts.items():
@@ -81,6 +81,9 @@ def describe_parts(
             weights["own"] = {"sha256": str(own)}
         if weights:
             described[slot]["weights"] = weights
+        chosen = getattr(getattr(parts, slot, None), "chosen", "")
+        if chosen:
+            described[slot]["chosen"] = str(chosen)
     return described
 
 

@@ -50,3 +50,50 @@ def make_problem(n=5, h=6, w=8, reach=2, dtype=torch.float64, noise=0.0, seed=0,
 @pytest.fixture
 def make():
     return make_problem
+
+
+def torch_backend(**options):
+    from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster, TorchBundleOptions
+
+    return TorchBundleAdjuster(TorchBundleOptions(**options))
+
+
+def native_backend(**options):
+    from droidw_plugins.bundle.native_ba import COMPONENT, NativeBundleAdjuster, NativeBundleOptions
+
+    reason = COMPONENT.available()
+    if reason:
+        pytest.skip(f"backend native cannot run here: {reason}")
+    return NativeBundleAdjuster(NativeBundleOptions(**options))
+
+
+BACKENDS = {"torch": torch_backend, "native": native_backend}
+
+
+@pytest.fixture(params=BACKENDS)
+def backend(request):
+    """Makes an adjuster of every backend that can run here; options by name."""
+    return BACKENDS[request.param]
+
+
+@pytest.fixture
+def step(backend):
+    """One step of every backend, from a fresh adjuster."""
+    return lambda problem, **options: backend(**options).step(problem)
+
+
+@pytest.fixture
+def descend(backend):
+    """Steps until one is not "ok": the problem where they end, and their reports."""
+
+    def run(problem, steps):
+        adjuster, reports = backend(), []
+        for _ in range(steps):
+            result = adjuster.step(problem)
+            reports.append(result.report)
+            problem = replace(problem, T_cw=result.T_cw, disps=result.disps)
+            if result.report.status != "ok":
+                break
+        return problem, reports
+
+    return run

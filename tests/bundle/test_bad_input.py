@@ -8,13 +8,8 @@ import pytest
 import torch
 
 from droidw.geometry import projective
-from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 
 NAN, INF = float("nan"), float("inf")
-
-
-def step(problem):
-    return TorchBundleAdjuster().step(problem)
 
 
 def assert_unchanged(result, problem):
@@ -30,7 +25,7 @@ def assert_finite(result):
 @pytest.mark.parametrize("field", ["target", "weight"])
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
 @pytest.mark.parametrize("guard", [False, True])
-def test_measurements_that_are_not_finite_are_dropped_and_counted(make, field, value, guard):
+def test_measurements_that_are_not_finite_are_dropped_and_counted(make, field, value, guard, step):
     if field == "weight" and value == -INF:
         value = NAN
     p, _, _ = make(noise=0.02, guard=guard)
@@ -48,7 +43,7 @@ def test_measurements_that_are_not_finite_are_dropped_and_counted(make, field, v
     assert torch.equal(got.disps, expected.disps)
 
 
-def test_nothing_but_nan(make):
+def test_nothing_but_nan(make, step):
     p, _, _ = make(noise=0.02)
     p = replace(p, target=torch.full_like(p.target, NAN))
     got = step(p)
@@ -58,7 +53,7 @@ def test_nothing_but_nan(make):
     assert_unchanged(got, p)
 
 
-def test_a_frame_without_edges_is_held_and_named(make):
+def test_a_frame_without_edges_is_held_and_named(make, step):
     p, _, _ = make(noise=0.02)
     keep = (p.ii != 3) & (p.jj != 3)
     p = replace(
@@ -73,7 +68,7 @@ def test_a_frame_without_edges_is_held_and_named(make):
         assert not torch.equal(got.T_cw[2], p.T_cw[2])
 
 
-def test_a_frame_whose_edges_weigh_nothing_is_held_and_named(make):
+def test_a_frame_whose_edges_weigh_nothing_is_held_and_named(make, step):
     p, _, _ = make(noise=0.02)
     weight = p.weight.clone()
     weight[(p.ii == 3) | (p.jj == 3)] = 0.0
@@ -83,7 +78,7 @@ def test_a_frame_whose_edges_weigh_nothing_is_held_and_named(make):
     assert torch.equal(got.T_cw[3], p.T_cw[3])
 
 
-def test_a_frame_without_edges_still_follows_its_prior(make):
+def test_a_frame_without_edges_still_follows_its_prior(make, step):
     p, _, _ = make(noise=0.02)
     keep = (p.ii != 3) & (p.jj != 3)
     p = replace(p, ii=p.ii[keep], jj=p.jj[keep], target=p.target[keep], weight=p.weight[keep])
@@ -95,7 +90,7 @@ def test_a_frame_without_edges_still_follows_its_prior(make):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_a_free_gauge_without_damping_is_singular(make, dtype):
+def test_a_free_gauge_without_damping_is_singular(make, dtype, step):
     p, _, _ = make(n=2, reach=1, dtype=dtype, noise=0.02, lm=0.0, ep=0.0)
     p = replace(p, damping=torch.zeros_like(p.damping))
     for fixed in ([False, False], [True, False]):  # six and one free directions, plus scale
@@ -105,14 +100,14 @@ def test_a_free_gauge_without_damping_is_singular(make, dtype):
         assert_unchanged(got, q)
 
 
-def test_damping_makes_a_free_gauge_solvable(make):
+def test_damping_makes_a_free_gauge_solvable(make, step):
     p, _, _ = make(n=2, reach=1, noise=0.02, lm=1e-4, ep=0.1)
     got = step(replace(p, fixed=torch.zeros(2, dtype=torch.bool)))
     assert got.report.status == "ok"
     assert_finite(got)
 
 
-def test_no_edges_at_all(make):
+def test_no_edges_at_all(make, step):
     p, _, _ = make()
     none = torch.zeros(0, dtype=torch.int64)
     p = replace(p, ii=none, jj=none, target=p.target[:0], weight=p.weight[:0])
@@ -123,14 +118,14 @@ def test_no_edges_at_all(make):
         assert_unchanged(got, p)
 
 
-def test_nothing_free_in_motion_only(make):
+def test_nothing_free_in_motion_only(make, step):
     p, _, _ = make(noise=0.02, motion_only=True, fixed=torch.ones(5, dtype=torch.bool))
     got = step(p)
     assert got.report.status == "empty"
     assert_unchanged(got, p)
 
 
-def test_everything_behind_the_camera(make):
+def test_everything_behind_the_camera(make, step):
     p, _, _ = make()
     T_cw = p.T_cw.clone()
     T_cw[:, 2] += -40.0 * torch.arange(5)
@@ -152,7 +147,7 @@ def test_everything_behind_the_camera(make):
 
 @pytest.mark.parametrize("field", ["T_cw", "disps", "intrinsics"])
 @pytest.mark.parametrize("guard", [False, True])
-def test_a_state_that_is_not_finite_is_reported(make, field, guard):
+def test_a_state_that_is_not_finite_is_reported(make, field, guard, step):
     p, _, _ = make(noise=0.02, guard=guard)
     broken = getattr(p, field).clone()
     broken.view(-1)[-1] = NAN
@@ -161,7 +156,7 @@ def test_a_state_that_is_not_finite_is_reported(make, field, guard):
     torch.testing.assert_close(got.T_cw, broken if field == "T_cw" else p.T_cw, equal_nan=True)
 
 
-def test_a_cell_whose_damping_is_not_finite_keeps_its_depth(make):
+def test_a_cell_whose_damping_is_not_finite_keeps_its_depth(make, step):
     p, _, _ = make(noise=0.02)
     damping = p.damping.clone()
     damping[1, 2, 3] = NAN
@@ -172,7 +167,7 @@ def test_a_cell_whose_damping_is_not_finite_keeps_its_depth(make):
 
 
 @pytest.mark.parametrize("guard", [False, True])
-def test_values_that_overflow_single_precision(make, guard):
+def test_values_that_overflow_single_precision(make, guard, step):
     p, _, _ = make(dtype=torch.float32, noise=0.02, guard=guard)
     target = p.target.clone()
     target[0, 0, 0] = 1e30
@@ -182,7 +177,7 @@ def test_values_that_overflow_single_precision(make, guard):
     assert_finite(got)
 
 
-def test_an_edge_from_a_frame_to_itself_is_harmless(make):
+def test_an_edge_from_a_frame_to_itself_is_harmless(make, step):
     p, _, _ = make(noise=0.02)
     expected = step(p)
     own = torch.tensor([2])

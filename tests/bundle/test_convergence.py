@@ -9,18 +9,6 @@ import torch
 
 from droidw.geometry import se3
 from droidw.geometry.align import umeyama
-from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster, TorchBundleOptions
-
-
-def descend(problem, steps):
-    adjuster, reports = TorchBundleAdjuster(), []
-    for _ in range(steps):
-        result = adjuster.step(problem)
-        reports.append(result.report)
-        problem = replace(problem, T_cw=result.T_cw, disps=result.disps)
-        if result.report.status != "ok":
-            break
-    return problem, reports
 
 
 def centres(T_cw):
@@ -29,7 +17,7 @@ def centres(T_cw):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_eight_keyframes_converge_to_the_truth(make, dtype, seed):
+def test_eight_keyframes_converge_to_the_truth(make, dtype, seed, descend):
     start, T_cw, disps = make(
         n=8, h=12, w=16, reach=3, dtype=dtype, noise=0.03, seed=seed, lm=1e-5, ep=1e-3, guard=True
     )
@@ -47,7 +35,7 @@ def test_eight_keyframes_converge_to_the_truth(make, dtype, seed):
     assert float(relative.abs().median()) < (1e-7 if dtype == torch.float64 else 1e-4)
 
 
-def test_the_prior_gives_the_scale(make):
+def test_the_prior_gives_the_scale(make, descend):
     start, T_cw, disps = make(n=6, h=8, w=10, noise=0.02)
     start = replace(start, prior=disps, prior_weight=0.5, lm=1e-5, ep=1e-4)
     end, _ = descend(start, 25)
@@ -55,7 +43,7 @@ def test_the_prior_gives_the_scale(make):
     torch.testing.assert_close(end.disps, disps, atol=1e-6, rtol=0)
 
 
-def test_motion_only_finds_the_poses_for_given_depths(make):
+def test_motion_only_finds_the_poses_for_given_depths(make, descend):
     start, T_cw, disps = make(n=6, h=8, w=10, noise=0.03, motion_only=True)
     end, _ = descend(replace(start, disps=disps, ep=1e-3), 10)
     torch.testing.assert_close(end.T_cw, T_cw, atol=1e-9, rtol=0)
@@ -64,7 +52,7 @@ def test_motion_only_finds_the_poses_for_given_depths(make):
 @pytest.mark.parametrize("huber", [None, 0.5])
 @pytest.mark.parametrize("noise", [0.02, 0.08, 0.2])
 @pytest.mark.parametrize("prior_weight", [0.0, 0.05])
-def test_the_guard_never_lets_the_cost_rise(make, huber, noise, prior_weight):
+def test_the_guard_never_lets_the_cost_rise(make, huber, noise, prior_weight, descend):
     p, _, disps = make(n=6, h=8, w=10, noise=noise, lm=0.0, ep=1e-6, guard=True, huber=huber)
     g = torch.Generator().manual_seed(5)
     wild = torch.rand(p.target.shape[:3], generator=g) < 0.15
@@ -80,7 +68,7 @@ def test_the_guard_never_lets_the_cost_rise(make, huber, noise, prior_weight):
             assert r.cost_after <= r.cost_before
 
 
-def test_huber_resists_outliers(make):
+def test_huber_resists_outliers(make, descend):
     p, T_cw, _ = make(n=6, h=8, w=10, noise=0.02, guard=True, ep=1e-3)
     g = torch.Generator().manual_seed(8)
     wild = torch.rand(p.target.shape[:3], generator=g) < 0.1
@@ -98,20 +86,20 @@ def test_huber_resists_outliers(make):
     assert error(robust) < 0.1 * error(plain)
 
 
-def test_guard_shortens_a_step_that_would_overshoot(make):
+def test_guard_shortens_a_step_that_would_overshoot(make, step):
     p, _, _ = make(n=5, h=6, w=8, noise=0.5, lm=0.0, ep=1e-9, seed=0)
-    free_run = TorchBundleAdjuster().step(p)
-    guarded = TorchBundleAdjuster().step(replace(p, guard=True))
+    free_run = step(p)
+    guarded = step(replace(p, guard=True))
     assert guarded.report.status == "ok"
     assert guarded.report.cost_after < guarded.report.cost_before
     assert guarded.report.step_norm == pytest.approx(0.5 * free_run.report.step_norm)
-    never = TorchBundleAdjuster(TorchBundleOptions(halvings=0)).step(replace(p, guard=True))
+    never = step(replace(p, guard=True), halvings=0)
     assert never.report.status == "rejected"
     assert torch.equal(never.T_cw, p.T_cw)
     assert torch.equal(never.disps, p.disps)
 
 
-def test_a_finished_problem_is_left_at_rest(make):
+def test_a_finished_problem_is_left_at_rest(make, descend):
     p, T_cw, disps = make(guard=True)
     end, reports = descend(p, 3)
     assert all(r.status in ("ok", "rejected") for r in reports)
@@ -120,14 +108,14 @@ def test_a_finished_problem_is_left_at_rest(make):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_gauge_freedom(make, seed):
+def test_gauge_freedom(make, seed, step):
     """A similarity of the world changes no residual, so the cost is the same and steps agree."""
     p, _, _ = make(noise=0.02, seed=seed, lm=1e-3, ep=0.0)
     p = replace(p, damping=torch.zeros_like(p.damping))
     g = torch.Generator().manual_seed(seed)
     world = se3.exp(torch.randn(6, generator=g, dtype=torch.float64))
     moved = replace(p, T_cw=se3.mul(p.T_cw, world))
-    a, b = TorchBundleAdjuster().step(p), TorchBundleAdjuster().step(moved)
+    a, b = step(p), step(moved)
     assert b.report.cost_before == pytest.approx(a.report.cost_before, rel=1e-9)
     torch.testing.assert_close(
         se3.matrix(b.T_cw), se3.matrix(se3.mul(a.T_cw, world)), atol=1e-8, rtol=0
@@ -137,7 +125,7 @@ def test_gauge_freedom(make, seed):
     scale = 3.0
     larger = p.T_cw.clone()
     larger[:, :3] *= scale
-    c = TorchBundleAdjuster().step(replace(p, T_cw=larger, disps=p.disps / scale, min_disp=1e-9))
+    c = step(replace(p, T_cw=larger, disps=p.disps / scale, min_disp=1e-9))
     assert c.report.cost_before == pytest.approx(a.report.cost_before, rel=1e-9)
     torch.testing.assert_close(c.disps * scale, a.disps, atol=1e-7, rtol=0)
     # the step of the translation scales with the world; exp mixes it with the turn by V(phi)

@@ -81,7 +81,8 @@ def test_keys_exist():
 
 
 def test_environment_variables_are_real():
-    sources = "".join(p.read_text() for p in (ROOT / "droidw").rglob("*.py"))
+    files = [*(ROOT / "droidw").rglob("*.py"), *(ROOT / "plugins").rglob("*.py")]
+    sources = "".join(p.read_text() for p in files)
     for page in PAGES:
         for name in set(re.findall(r"\bDROIDW_[A-Z_]+\b", page.read_text())):
             assert name in sources, f"{page.name}: {name}"

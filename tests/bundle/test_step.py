@@ -1,4 +1,4 @@
-"""The torch backend against dense normal equations, and its promises about every step."""
+"""Every backend against dense normal equations, and its promises about every step."""
 
 from __future__ import annotations
 
@@ -8,11 +8,6 @@ import pytest
 import torch
 
 from droidw.geometry import projective, se3
-from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster, TorchBundleOptions
-
-
-def step(problem, **options):
-    return TorchBundleAdjuster(TorchBundleOptions(**options)).step(problem)
 
 
 def robust_length(weight, r):
@@ -94,7 +89,7 @@ CASES = {
 
 @pytest.mark.parametrize("with_prior", [False, True])
 @pytest.mark.parametrize("case", CASES)
-def test_schur_solution_is_the_dense_one(make, case, with_prior):
+def test_schur_solution_is_the_dense_one(make, case, with_prior, step):
     changes = dict(CASES[case])
     left_out = changes.pop("leave_out_source", None)
     p, _, _ = make(noise=0.02, **changes)
@@ -114,7 +109,7 @@ def test_schur_solution_is_the_dense_one(make, case, with_prior):
     assert torch.equal(got.T_cw[p.fixed], p.T_cw[p.fixed])
 
 
-def test_near_cells_do_not_count(make):
+def test_near_cells_do_not_count(make, step):
     p, _, _ = make(noise=0.01)
     disps = p.disps.clone()
     T_cw = p.T_cw.clone()
@@ -128,7 +123,7 @@ def test_near_cells_do_not_count(make):
     torch.testing.assert_close(got.disps, expected_disps, atol=1e-8, rtol=1e-8)
 
 
-def test_energy_is_what_the_problem_defines(make):
+def test_energy_is_what_the_problem_defines(make, step):
     p, _, _ = make(noise=0.02)
     p = replace(p, prior=prior_of(p.disps), prior_weight=0.4)
     coords, _ = projective.reproject(p.T_cw, p.disps, p.intrinsics, p.ii, p.jj)
@@ -143,7 +138,7 @@ def test_energy_is_what_the_problem_defines(make):
     assert step(replace(p, huber=0.2)).report.cost_before == pytest.approx(expected, rel=1e-12)
 
 
-def test_robust_length_is_the_plain_one_for_equal_weights(make):
+def test_robust_length_is_the_plain_one_for_equal_weights(make, step):
     p, _, _ = make(noise=0.02, huber=0.2)
     weight = p.weight.mean(-1, keepdim=True).expand_as(p.weight)
     coords, _ = projective.reproject(p.T_cw, p.disps, p.intrinsics, p.ii, p.jj)
@@ -153,14 +148,14 @@ def test_robust_length_is_the_plain_one_for_equal_weights(make):
     assert step(replace(p, weight=weight)).report.cost_before == pytest.approx(expected, rel=1e-12)
 
 
-def test_depths_stay_and_priors_are_left_alone_in_motion_only(make):
+def test_depths_stay_and_priors_are_left_alone_in_motion_only(make, step):
     p, _, _ = make(noise=0.02, motion_only=True, min_disp=0.4)
     got = step(replace(p, prior=prior_of(p.disps), prior_weight=1.0))
     assert torch.equal(got.disps, p.disps)
     assert got.disps.data_ptr() != p.disps.data_ptr()
 
 
-def test_the_input_is_not_written_to(make):
+def test_the_input_is_not_written_to(make, step):
     p, _, _ = make(noise=0.02, guard=True)
     before = [t.clone() for t in (p.T_cw, p.disps, p.target, p.weight, p.fixed, p.damping)]
     got = step(p)
@@ -177,7 +172,7 @@ def shuffled(p, seed):
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_the_order_of_the_edges_changes_nothing(make, dtype):
+def test_the_order_of_the_edges_changes_nothing(make, dtype, step):
     p, _, _ = make(noise=0.02, dtype=dtype)
     expected = step(p)
     for seed in range(3):
@@ -186,7 +181,7 @@ def test_the_order_of_the_edges_changes_nothing(make, dtype):
         assert torch.equal(got.disps, expected.disps)
 
 
-def test_an_edge_given_twice_counts_twice(make):
+def test_an_edge_given_twice_counts_twice(make, step):
     p, _, _ = make(noise=0.02)
     twice = replace(
         p,
@@ -202,10 +197,10 @@ def test_an_edge_given_twice_counts_twice(make):
         torch.testing.assert_close(got.disps, disps, atol=1e-9, rtol=0)
 
 
-def test_same_input_same_bytes_also_from_used_scratch_space(make):
+def test_same_input_same_bytes_also_from_used_scratch_space(make, step, backend):
     p, _, _ = make(noise=0.02, dtype=torch.float32)
     other, _, _ = make(n=7, h=9, w=7, noise=0.05, dtype=torch.float32, guard=True)
-    adjuster = TorchBundleAdjuster()
+    adjuster = backend()
     first = adjuster.step(p)
     adjuster.step(other)
     again = adjuster.step(p)
@@ -217,13 +212,16 @@ def test_same_input_same_bytes_also_from_used_scratch_space(make):
 
 
 def test_chunks_change_nothing_that_matters(make):
+    from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster, TorchBundleOptions
+
     p, _, _ = make(noise=0.02, guard=True)
-    whole, parts = step(p), step(p, chunk_cells=100)
+    whole = TorchBundleAdjuster().step(p)
+    parts = TorchBundleAdjuster(TorchBundleOptions(chunk_cells=100)).step(p)
     torch.testing.assert_close(parts.T_cw, whole.T_cw, atol=1e-12, rtol=0)
     torch.testing.assert_close(parts.disps, whole.disps, atol=1e-11, rtol=0)
 
 
-def test_single_precision_is_close_to_double(make):
+def test_single_precision_is_close_to_double(make, step):
     p, _, _ = make(noise=0.02)
     exact = step(p)
     single = {

@@ -1,0 +1,239 @@
+// One cell of one edge: projection, Jacobians, residual, robust weight (REFERENCE 2.2, 2.3, 3.1).
+//
+// R is a number (float, double) or a pack of them; S is its element. The same functions run in a
+// CUDA thread, in a plain loop, and over SIMD registers.
+#pragma once
+
+#include "real.h"
+
+namespace dw {
+
+// Least relative depth of a usable cell; droidw.geometry.projective.NEAR.
+constexpr double NEAR_DEPTH = 0.25;
+
+template <class S>
+struct Camera {
+    S fx, fy, cx, cy;
+};
+
+// G_ij = T_j T_i^-1 as rotation (row by row) and translation.
+template <class S>
+struct Motion {
+    S R[9], t[3];
+};
+
+// Place in the image plane of j: a = X / Z, b = Y / Z, with Z clamped to the near plane.
+template <class R>
+struct Seen {
+    R a, b, inv_z, ok;
+};
+
+template <class R, class S>
+DW_HD Seen<R> project(const Motion<S>& G, R ray_x, R ray_y, R d) {
+    const R X = fill<R>(G.R[0]) * ray_x + (fill<R>(G.R[1]) * ray_y + (fill<R>(G.t[0]) * d + fill<R>(G.R[2])));
+    const R Y = fill<R>(G.R[3]) * ray_x + (fill<R>(G.R[4]) * ray_y + (fill<R>(G.t[1]) * d + fill<R>(G.R[5])));
+    const R Z = fill<R>(G.R[6]) * ray_x + (fill<R>(G.R[7]) * ray_y + (fill<R>(G.t[2]) * d + fill<R>(G.R[8])));
+    const R nearest = fill<R>(S(NEAR_DEPTH)), one = fill<R>(S(1)), zero = fill<R>(S(0));
+    Seen<R> p;
+    p.ok = select(Z >= nearest, one, zero);
+    p.inv_z = one / at_least(Z, nearest);
+    p.a = X * p.inv_z;
+    p.b = Y * p.inv_z;
+    return p;
+}
+
+// Relative depth alone, for the near test.
+template <class R, class S>
+DW_HD R depth_ratio(const Motion<S>& G, R ray_x, R ray_y, R d) {
+    return fill<R>(G.R[6]) * ray_x + (fill<R>(G.R[7]) * ray_y + (fill<R>(G.t[2]) * d + fill<R>(G.R[8])));
+}
+
+// Weighted measurement of a cell. `wu`, `wv` hold the robust weight already.
+template <class R>
+struct Measured {
+    R ru, rv, wu, wv, energy;
+};
+
+// Residual, weights 0 where `ok` is 0, Huber weight and robust energy (huber < 0: quadratic).
+template <class R, class S>
+DW_HD Measured<R> measure(
+    const Camera<S>& K, const Seen<R>& p, R ok, R tu, R tv, R wu, R wv, S huber) {
+    Measured<R> m;
+    m.ru = tu - (fill<R>(K.fx) * p.a + fill<R>(K.cx));
+    m.rv = tv - (fill<R>(K.fy) * p.b + fill<R>(K.cy));
+    m.wu = wu * ok;
+    m.wv = wv * ok;
+    m.energy = m.wu * m.ru * m.ru + m.wv * m.rv * m.rv;
+    if (huber >= S(0)) {
+        const R limit = fill<R>(huber);
+        const R mean = at_least(fill<R>(S(0.5)) * (m.wu + m.wv), fill<R>(Limits<S>::tiny));
+        const R knee = limit / at_least(root(m.energy / mean), limit);
+        m.wu = m.wu * knee;
+        m.wv = m.wv * knee;
+        m.energy = m.energy * (knee * (fill<R>(S(2)) - knee));
+    }
+    return m;
+}
+
+// A measurement that is not finite gets the weight and target 0; returns 1 where it was dropped.
+template <class R>
+DW_HD R drop_nonfinite(R& tu, R& tv, R& wu, R& wv) {
+    using S = element<R>;
+    const R zero = fill<R>(S(0)), one = fill<R>(S(1));
+    const auto usable = finite_number(wu * (tu * tu)) & finite_number(wv * (tv * tv));
+    tu = select(usable, tu, zero);
+    tv = select(usable, tv, zero);
+    wu = select(usable, wu, zero);
+    wv = select(usable, wv, zero);
+    return select(usable, zero, one);
+}
+
+// Linearised cell. Rows of the Jacobian with respect to the target's pose, in normalised image
+// units: u = (h, 0, u2, u3, u4, u5) and v = (0, h, v2, v3, v4, v5); the focal length is in su,
+// sv (weight of a product of two rows) and gu, gv (weight times residual).
+template <class R>
+struct Linear {
+    R h, u2, u3, u4, u5, v2, v3, v4, v5;
+    R zu, zv;  // derivative with respect to the disparity of the cell
+    R su, sv, gu, gv;
+};
+
+template <class R, class S>
+DW_HD Linear<R> linearise(
+    const Camera<S>& K, const Motion<S>& G, const Seen<R>& p, const Measured<R>& m, R d) {
+    const R one = fill<R>(S(1)), fx = fill<R>(K.fx), fy = fill<R>(K.fy);
+    const R tx = fill<R>(G.t[0]), ty = fill<R>(G.t[1]), tz = fill<R>(G.t[2]);
+    Linear<R> l;
+    l.h = d * p.inv_z;
+    const R ab = p.a * p.b;
+    l.u2 = -(p.a * l.h);
+    l.u3 = -ab;
+    l.u4 = one + p.a * p.a;
+    l.u5 = -p.b;
+    l.v2 = -(p.b * l.h);
+    l.v3 = -(one + p.b * p.b);
+    l.v4 = ab;
+    l.v5 = p.a;
+    l.zu = p.inv_z * (tx - tz * p.a);
+    l.zv = p.inv_z * (ty - tz * p.b);
+    const R wfu = m.wu * fx, wfv = m.wv * fy;
+    l.su = wfu * fx;
+    l.sv = wfv * fy;
+    l.gu = wfu * m.ru;
+    l.gv = wfv * m.rv;
+    return l;
+}
+
+// Entries of the upper triangle of the 6x6 block, row by row, and the right side.
+constexpr int HESSIAN = 21, GRADIENT = 6, POSE_SUMS = HESSIAN + GRADIENT;
+
+DW_HD constexpr int upper(int r, int c) { return r * 6 - r * (r - 1) / 2 + (c - r); }
+
+// Adds W J_j^T J_j and W J_j^T r of G numbers (packs of cells, or one cell) to POSE_SUMS sums. Each
+// sum is touched once for all of them, since there are more sums than registers.
+template <int G, class R>
+DW_HD void add_pose_sums(const Linear<R>* l, R* sums) {
+    R h[G], u2[G], u3[G], u4[G], k[G], v2[G], v3[G], v4[G];
+    for (int g = 0; g < G; ++g) {
+        h[g] = l[g].su * l[g].h;
+        u2[g] = l[g].su * l[g].u2;
+        u3[g] = l[g].su * l[g].u3;
+        u4[g] = l[g].su * l[g].u4;
+        k[g] = l[g].sv * l[g].h;
+        v2[g] = l[g].sv * l[g].v2;
+        v3[g] = l[g].sv * l[g].v3;
+        v4[g] = l[g].sv * l[g].v4;
+    }
+#define DW_ADD(at, x, y) \
+    {                    \
+        R sum = sums[at]; \
+        for (int g = 0; g < G; ++g) sum += (x) * (y); \
+        sums[at] = sum;  \
+    }
+#define DW_ADD2(at, x, y, z, w) \
+    {                           \
+        R sum = sums[at];       \
+        for (int g = 0; g < G; ++g) sum += (x) * (y) + (z) * (w); \
+        sums[at] = sum;         \
+    }
+    DW_ADD(upper(0, 0), h[g], l[g].h)
+    DW_ADD(upper(0, 2), h[g], l[g].u2)
+    DW_ADD(upper(0, 3), h[g], l[g].u3)
+    DW_ADD(upper(0, 4), h[g], l[g].u4)
+    DW_ADD(upper(0, 5), h[g], l[g].u5)
+    DW_ADD(upper(1, 1), k[g], l[g].h)
+    DW_ADD(upper(1, 2), k[g], l[g].v2)
+    DW_ADD(upper(1, 3), k[g], l[g].v3)
+    DW_ADD(upper(1, 4), k[g], l[g].v4)
+    DW_ADD(upper(1, 5), k[g], l[g].v5)
+    DW_ADD2(upper(2, 2), u2[g], l[g].u2, v2[g], l[g].v2)
+    DW_ADD2(upper(2, 3), u2[g], l[g].u3, v2[g], l[g].v3)
+    DW_ADD2(upper(2, 4), u2[g], l[g].u4, v2[g], l[g].v4)
+    DW_ADD2(upper(2, 5), u2[g], l[g].u5, v2[g], l[g].v5)
+    DW_ADD2(upper(3, 3), u3[g], l[g].u3, v3[g], l[g].v3)
+    DW_ADD2(upper(3, 4), u3[g], l[g].u4, v3[g], l[g].v4)
+    DW_ADD2(upper(3, 5), u3[g], l[g].u5, v3[g], l[g].v5)
+    DW_ADD2(upper(4, 4), u4[g], l[g].u4, v4[g], l[g].v4)
+    DW_ADD2(upper(4, 5), u4[g], l[g].u5, v4[g], l[g].v5)
+    DW_ADD2(upper(5, 5), l[g].su * l[g].u5, l[g].u5, l[g].sv * l[g].v5, l[g].v5)
+    DW_ADD(HESSIAN + 0, l[g].gu, l[g].h)
+    DW_ADD(HESSIAN + 1, l[g].gv, l[g].h)
+    DW_ADD2(HESSIAN + 2, l[g].gu, l[g].u2, l[g].gv, l[g].v2)
+    DW_ADD2(HESSIAN + 3, l[g].gu, l[g].u3, l[g].gv, l[g].v3)
+    DW_ADD2(HESSIAN + 4, l[g].gu, l[g].u4, l[g].gv, l[g].v4)
+    DW_ADD2(HESSIAN + 5, l[g].gu, l[g].u5, l[g].gv, l[g].v5)
+#undef DW_ADD
+#undef DW_ADD2
+}
+
+// E: W J_j^T J_z of a cell, six values.
+template <class R>
+DW_HD void coupling(const Linear<R>& l, R* E) {
+    const R eu = l.su * l.zu, ev = l.sv * l.zv;
+    E[0] = eu * l.h;
+    E[1] = ev * l.h;
+    E[2] = eu * l.u2 + ev * l.v2;
+    E[3] = eu * l.u3 + ev * l.v3;
+    E[4] = eu * l.u4 + ev * l.v4;
+    E[5] = eu * l.u5 + ev * l.v5;
+}
+
+// E^T y of a cell, without E.
+template <class R, class S>
+DW_HD R coupled_step(const Linear<R>& l, const S* y) {
+    const R u = l.h * fill<R>(y[0]) + l.u2 * fill<R>(y[2]) + l.u3 * fill<R>(y[3]) +
+                l.u4 * fill<R>(y[4]) + l.u5 * fill<R>(y[5]);
+    const R v = l.h * fill<R>(y[1]) + l.v2 * fill<R>(y[2]) + l.v3 * fill<R>(y[3]) +
+                l.v4 * fill<R>(y[4]) + l.v5 * fill<R>(y[5]);
+    return l.su * l.zu * u + l.sv * l.zv * v;
+}
+
+// W J_z^2 and W J_z r of a cell.
+template <class R>
+DW_HD R depth_curvature(const Linear<R>& l) {
+    return l.su * l.zu * l.zu + l.sv * l.zv * l.zv;
+}
+template <class R>
+DW_HD R depth_gradient(const Linear<R>& l) {
+    return l.gu * l.zu + l.gv * l.zv;
+}
+
+// The depth diagonal with prior or damping, its inverse Q (0 where it is 0), and the right side
+// (REFERENCE 3.2). prior is 0 where there is none.
+template <class R>
+struct Depth {
+    R Q, rhs;
+};
+
+template <class R, class S>
+DW_HD Depth<R> depth_system(R C, R w, R d, R damping, R prior, S prior_weight) {
+    const R zero = fill<R>(S(0)), one = fill<R>(S(1)), gamma = fill<R>(prior_weight);
+    const auto known = prior > zero;
+    C = C + select(known, gamma, damping);
+    Depth<R> out;
+    out.rhs = w - select(known, gamma * (d - prior), zero);
+    out.Q = select(C > fill<R>(Limits<S>::tiny * S(1e8)), one / C, zero);
+    return out;
+}
+
+}  // namespace dw

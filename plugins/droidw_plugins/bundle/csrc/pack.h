@@ -1,0 +1,133 @@
+// Several cells in one SIMD register, by the vector extension that g++ and clang share.
+#pragma once
+
+#include <string.h>
+
+#include "real.h"
+
+#if defined(__AVX512F__)
+#define DW_BYTES 64
+#elif defined(__AVX__)
+#define DW_BYTES 32
+#else
+#define DW_BYTES 16
+#endif
+
+namespace dw {
+
+template <class S>
+struct Register;
+template <>
+struct Register<float> {
+    typedef float type __attribute__((vector_size(DW_BYTES)));
+    typedef int32_t mask __attribute__((vector_size(DW_BYTES)));
+};
+template <>
+struct Register<double> {
+    typedef double type __attribute__((vector_size(DW_BYTES)));
+    typedef int64_t mask __attribute__((vector_size(DW_BYTES)));
+};
+
+template <class S>
+struct Pack {
+    using V = typename Register<S>::type;
+    static constexpr int lanes = DW_BYTES / int(sizeof(S));
+    V v;
+
+    Pack() = default;
+    DW_HD Pack(V v_) : v(v_) {}
+    DW_HD Pack(S s) { v = V{} + s; }
+    static DW_HD Pack load(const S* from) {
+        Pack p;
+        memcpy(&p.v, from, sizeof(V));
+        return p;
+    }
+    DW_HD void store(S* to) const { memcpy(to, &v, sizeof(V)); }
+    DW_HD S operator[](int k) const { return v[k]; }
+    DW_HD Pack& operator+=(Pack o) { v += o.v; return *this; }
+    DW_HD Pack& operator-=(Pack o) { v -= o.v; return *this; }
+    DW_HD Pack& operator*=(Pack o) { v *= o.v; return *this; }
+
+    friend DW_HD Pack operator+(Pack a, Pack b) { return a.v + b.v; }
+    friend DW_HD Pack operator-(Pack a, Pack b) { return a.v - b.v; }
+    friend DW_HD Pack operator*(Pack a, Pack b) { return a.v * b.v; }
+    friend DW_HD Pack operator/(Pack a, Pack b) { return a.v / b.v; }
+    friend DW_HD Pack operator-(Pack a) { return -a.v; }
+};
+
+template <class S>
+struct Mask {
+    typename Register<S>::mask m;
+    friend DW_HD Mask operator&(Mask a, Mask b) { return {a.m & b.m}; }
+    friend DW_HD Mask operator|(Mask a, Mask b) { return {a.m | b.m}; }
+};
+
+template <class S>
+DW_HD Mask<S> operator<(Pack<S> a, Pack<S> b) { return {a.v < b.v}; }
+template <class S>
+DW_HD Mask<S> operator>=(Pack<S> a, Pack<S> b) { return {a.v >= b.v}; }
+template <class S>
+DW_HD Mask<S> operator>(Pack<S> a, Pack<S> b) { return {a.v > b.v}; }
+template <class S>
+DW_HD Mask<S> operator<=(Pack<S> a, Pack<S> b) { return {a.v <= b.v}; }
+
+template <class S>
+DW_HD Pack<S> select(Mask<S> mask, Pack<S> a, Pack<S> b) {
+    return Pack<S>(mask.m ? a.v : b.v);
+}
+
+template <class S>
+struct Element<Pack<S>> {
+    using type = S;
+};
+template <class S>
+struct Fill<Pack<S>> {
+    static DW_HD Pack<S> of(S s) { return Pack<S>(s); }
+};
+
+template <class S>
+DW_HD Pack<S> root(Pack<S> x) {
+    Pack<S> out;
+    for (int k = 0; k < Pack<S>::lanes; ++k) out.v[k] = root(x.v[k]);
+    return out;
+}
+
+template <class S>
+DW_HD Mask<S> finite_number(Pack<S> x) {
+    // x - x is 0 for finite numbers and NaN for all others
+    return {(x.v - x.v) == typename Pack<S>::V{}};
+}
+
+// Sum of the lanes in double precision, always in the same order.
+template <class S>
+DW_HD double total(Pack<S> x) {
+    constexpr int n = Pack<S>::lanes;
+    double t[n];
+    for (int k = 0; k < n; ++k) t[k] = double(x.v[k]);
+    for (int width = n / 2; width > 0; width /= 2)
+        for (int k = 0; k < width; ++k) t[k] += t[k + width];
+    return t[0];
+}
+
+// Separates pairs (x0 y0 x1 y1 ...) into x and y.
+template <class S>
+DW_HD void split_pairs(const S* from, Pack<S>& x, Pack<S>& y) {
+    constexpr int n = Pack<S>::lanes;
+    const Pack<S> low = Pack<S>::load(from), high = Pack<S>::load(from + n);
+    typename Register<S>::mask even, odd;
+    for (int k = 0; k < n; ++k) {
+        even[k] = 2 * k;
+        odd[k] = 2 * k + 1;
+    }
+#if defined(__clang__)
+    for (int k = 0; k < n; ++k) {
+        x.v[k] = k < n / 2 ? low.v[2 * k] : high.v[2 * k - n];
+        y.v[k] = k < n / 2 ? low.v[2 * k + 1] : high.v[2 * k + 1 - n];
+    }
+#else
+    x.v = __builtin_shuffle(low.v, high.v, even);
+    y.v = __builtin_shuffle(low.v, high.v, odd);
+#endif
+}
+
+}  // namespace dw
