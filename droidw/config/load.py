@@ -28,6 +28,7 @@ __all__ = [
     "load_config",
     "override_layers",
     "packaged_configs",
+    "read_yaml",
 ]
 
 LISTED = ("exporters", "observers")
@@ -156,7 +157,7 @@ class _Merger:
         if real in stack:
             chain = " -> ".join(p.name for p in (*stack[stack.index(real) :], real))
             raise ConfigError(f"{_shown(path)}: extends: the files extend each other: {chain}")
-        tree, lines = _read(path)
+        tree, lines = read_yaml(path)
         extends = tree.pop("extends", [])
         names = [extends] if isinstance(extends, str) else extends
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -298,7 +299,14 @@ def _shown(path: Path) -> str:
         return str(path)
 
 
-def _read(path: Path) -> tuple[_Tree, dict[str, Source]]:
+def read_yaml(path: Path) -> tuple[_Tree, dict[str, Source]]:
+    """The mapping in a YAML file, and where each full key is written.
+
+    Numbers such as 1e-3 are numbers, and a key that is written twice is refused.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds no mapping.
+    """
     shown = _shown(path)
     try:
         text = path.read_text(encoding="utf-8")
