@@ -8,6 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from droidw.geometry import se3
+from droidw.geometry.projective import reproject
 from droidw_plugins.uncertainty import _objective as objective
 
 F64 = torch.float64
@@ -15,6 +17,17 @@ F64 = torch.float64
 
 def _generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def _samples(coords: Tensor, valid: Tensor, ii: Tensor, jj: Tensor) -> objective.Samples:
+    """Samples of places [E,h,w,2], in the order that one writes them down."""
+    xy = coords.flatten(1, 2).transpose(1, 2)
+    return objective.make_samples(xy, valid.flatten(1), coords.shape[2], ii, jj)
+
+
+def _corners(samples: objective.Samples) -> Tensor:
+    """Rows [E*P,4] of the four neighbours."""
+    return samples.first[:, None] + torch.tensor(samples.steps)
 
 
 def _problem(seed: int = 0) -> tuple[Tensor, Tensor, objective.Samples]:
@@ -25,7 +38,7 @@ def _problem(seed: int = 0) -> tuple[Tensor, Tensor, objective.Samples]:
     coords[0, 0, 1] = float("nan")
     valid = torch.rand(4, 4, 5, generator=g) > 0.1
     ii, jj = torch.tensor([0, 0, 1, 2]), torch.tensor([1, 2, 0, 0])
-    samples = objective.make_samples(coords, valid, ii, jj)
+    samples = _samples(coords, valid, ii, jj)
     u = torch.rand(3, 20, generator=g, dtype=F64) + 0.2
     rho = torch.rand(4, 20, generator=g, dtype=F64) * samples.inside
     return u, rho, samples
@@ -37,12 +50,12 @@ def test_samples_are_the_bilinear_interpolation_of_the_grid() -> None:
     y, x = torch.meshgrid(torch.arange(4.0), torch.arange(5.0), indexing="ij")
     coords = torch.rand(1, 4, 5, 2, generator=_generator(1), dtype=F64) * 3
     valid = torch.ones(1, 4, 5, dtype=torch.bool)
-    found = objective.make_samples(coords, valid, torch.tensor([0]), torch.tensor([1]))
+    found = _samples(coords, valid, torch.tensor([0]), torch.tensor([1]))
     for axis, table in enumerate((x, y)):
         stack = torch.stack([torch.full((20,), -9.0), table.flatten()]).to(F64)
         sampled = objective.interpolate(stack, found)
         assert torch.allclose(sampled, coords[..., axis].flatten(1), atol=1e-12)
-    assert torch.allclose(found.weights.sum(1), torch.ones(20, dtype=F64))
+    assert torch.allclose(found.weights.sum(0), torch.ones(20, dtype=F64))
 
 
 def test_outside_behind_and_nan_take_no_part() -> None:
@@ -51,7 +64,7 @@ def test_outside_behind_and_nan_take_no_part() -> None:
     grid[0, 0] = coords
     valid = torch.ones(1, 4, 5, dtype=torch.bool)
     valid[0, 3] = False
-    samples = objective.make_samples(grid, valid, torch.tensor([0]), torch.tensor([0]))
+    samples = _samples(grid, valid, torch.tensor([0]), torch.tensor([0]))
     inside = samples.inside.view(4, 5)
     assert inside[0].tolist() == [False, False, False, False, True]
     assert bool(inside[1:3].all())
@@ -90,27 +103,15 @@ def test_frame_gradient_against_autograd_of_each_frames_own_energy() -> None:
     found = objective.frame_gradient(
         pair.view(3, 4, 5), u.detach().view(3, 4, 5), counts, 0.1, 0.05
     ).view(3, 20)
+    sums = objective.frame_gradient(pair.view(3, 4, 5), u.detach().view(3, 4, 5), None, 1.0, 0.05)
+    total = objective.pair_energy(u, rho, samples) + 0.05 * torch.log(u + 1).sum()
+    (expected,) = torch.autograd.grad(total, u)
+    assert torch.allclose(sums.view(3, 20), expected, atol=1e-9)
     for k in range(3):
         energy = 0.1 / (float(counts[k]) + 1e-6) * objective.pair_energy(u, rho, samples)
         energy = energy + 0.05 * torch.log(u + 1).sum()
         (expected,) = torch.autograd.grad(energy, u)
         assert torch.allclose(found[k], expected[k], atol=1e-9)
-
-
-def test_theta_gradient_by_chain_rule_against_autograd() -> None:
-    u0, rho, samples = _problem()
-    features = torch.randn(3, 20, 6, generator=_generator(2), dtype=F64)
-    theta = (torch.randn(7, generator=_generator(3), dtype=F64) * 0.3).requires_grad_()
-    y = features @ theta[:-1] + theta[-1]
-    u = objective.softplus(y, 0.1)
-    energy = objective.pair_energy(u, rho, samples) + 0.05 * torch.log(u + 1).sum()
-    (expected,) = torch.autograd.grad(energy, theta)
-    pair, _ = objective.pair_gradient(u.detach(), rho, samples)
-    weight = (pair + 0.05 / (u.detach() + 1)) * objective.softplus_slope(y.detach(), 0.1)
-    slope = torch.einsum("kp,kpc->c", weight, features)
-    found = torch.cat([slope, weight.sum()[None]])
-    assert float((found - expected).abs().max()) < 1e-6 * float(expected.abs().max())
-    assert u0.shape == u.shape
 
 
 def test_softplus_has_the_published_values_and_slope() -> None:
@@ -138,7 +139,7 @@ def test_fixed_points_are_the_published_ones(cosine: float, u: float) -> None:
         .expand(2, -1, -1, -1)
     )
     valid = torch.ones(2, 4, 5, dtype=torch.bool)
-    samples = objective.make_samples(coords, valid, torch.tensor([0, 1]), torch.tensor([1, 0]))
+    samples = _samples(coords, valid, torch.tensor([0, 1]), torch.tensor([1, 0]))
     rho = objective.residual(torch.full((2, 20), cosine, dtype=F64), samples, 0.5)
     table = torch.full((2, 20), 1.0, dtype=F64)
     for _ in range(3000):
@@ -153,19 +154,24 @@ def test_fixed_points_are_the_published_ones(cosine: float, u: float) -> None:
 
 def test_residual_follows_clamp_and_threshold() -> None:
     coords = torch.zeros(1, 1, 5, 2)
-    samples = objective.make_samples(
+    samples = _samples(
         coords, torch.ones(1, 1, 5, dtype=torch.bool), torch.tensor([0]), torch.tensor([0])
     )
     cosine = torch.tensor([[-0.3, 0.5, 0.51, 1.2, 0.9]])
     found = objective.residual(cosine, samples, 0.5)
     assert torch.allclose(found, torch.tensor([[1.0, 1.0, 0.49, 0.0, 0.1]]))
+    # the paper's form: neither clamped from below nor cut
+    plain = objective.residual(cosine, samples, -1.0, -1.0)
+    assert torch.allclose(plain, torch.tensor([[1.3, 0.5, 0.49, 0.0, 0.1]]))
+    clamped = objective.residual(cosine, samples, -1.0, 0.0)
+    assert torch.allclose(clamped, torch.tensor([[1.0, 0.5, 0.49, 0.0, 0.1]]))
 
 
 def test_similarity_is_the_cosine_with_the_interpolated_vector() -> None:
     _, _, samples = _problem(4)
     features = torch.randn(3, 20, 7, generator=_generator(6), dtype=F64)
     found = objective.similarity(features, samples)
-    there = (features.view(60, 7)[samples.corners] * samples.weights[..., None]).sum(1)
+    there = (features.view(60, 7)[_corners(samples)] * samples.weights.T[..., None]).sum(1)
     expected = torch.nn.functional.cosine_similarity(
         features[samples.source], there.view(4, 20, 7), dim=2
     )
@@ -179,6 +185,28 @@ def test_similarity_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch) -> Non
     whole = objective.similarity(features, samples)
     monkeypatch.setattr(objective, "_CHUNK", 1)
     assert torch.equal(objective.similarity(features, samples), whole)
+
+
+def test_projection_is_that_of_the_geometry() -> None:
+    g = _generator(8)
+    T_cw = se3.exp(torch.randn(3, 6, generator=g, dtype=F64) * 0.2)
+    disps = torch.rand(3, 4, 5, generator=g, dtype=F64) * 2
+    intrinsics = torch.tensor([4.0, 5.0, 2.1, 1.4], dtype=F64)
+    ii, jj = torch.tensor([0, 2, 1]), torch.tensor([1, 0, 2])
+    coords, valid = reproject(T_cw, disps, intrinsics, ii, jj)
+    xy, near = objective.project(T_cw, disps, intrinsics, ii, jj)
+    assert torch.equal(near.view(3, 4, 5), valid)
+    assert torch.allclose(xy.view(3, 2, 4, 5), coords.movedim(-1, 1), atol=1e-12)
+
+
+def test_samples_of_some_edges() -> None:
+    u, _, samples = _problem()
+    whole = objective.interpolate(u, samples)
+    chosen = torch.tensor([True, False, True, True])
+    assert torch.equal(objective.interpolate(u, samples.of(chosen)), whole[chosen])
+    some = samples.of(torch.tensor([2]))
+    assert torch.equal(some.inside, samples.inside[2:3])
+    assert torch.equal(some.place, samples.place[2:3])
 
 
 def test_edges_between_neighbours_do_not_count() -> None:

@@ -17,7 +17,9 @@ __all__ = ["droidw_uncertainty_models"]
 @hookimpl
 def droidw_uncertainty_models() -> Iterable[Component[UncertaintyModel]]:
     """Light records only: the factory of each imports what it needs."""
-    from droidw_plugins.uncertainty import affine_softplus, none
+    from droidw_plugins.uncertainty import affine_softplus, mlp, none, per_pixel
 
     yield affine_softplus.COMPONENT
+    yield per_pixel.COMPONENT
+    yield mlp.COMPONENT
     yield none.COMPONENT

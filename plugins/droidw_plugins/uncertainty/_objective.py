@@ -11,11 +11,15 @@ cheaper than to pick out the rest. K keyframes have P = h*w cells each; tables h
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
+
+from droidw.geometry import se3
+from droidw.geometry.projective import NEAR, pixel_grid, relative_pose
 
 __all__ = [
     "Samples",
@@ -25,6 +29,7 @@ __all__ = [
     "make_samples",
     "pair_energy",
     "pair_gradient",
+    "project",
     "residual",
     "scatter",
     "similarity",
@@ -43,16 +48,31 @@ class Samples:
 
     Attributes:
         source: [E] frame i, row of a stack [K,P].
-        corners: [E*P,4] int32 rows of the four neighbours of the place in j, in a table [K*P].
-        weights: [E*P,4] bilinear weights, which add up to one.
-        inside: [E,P] bool, in front of the camera and within the grid; elsewhere corners and
-            weights are those of the nearest cell, and meaningless.
+        place: [E,2,P] place in j, row of x then row of y, moved to the border where it is outside.
+        first: [E*P] upper left of the four neighbours of the place in j, row of a table [K*P].
+        steps: from there to the upper left, upper right, lower left and lower right neighbour.
+        weights: [4,E*P] their bilinear weights, which add up to one.
+        inside: [E,P] bool, in front of the camera and within the grid.
     """
 
     source: Tensor
-    corners: Tensor
+    place: Tensor
+    first: Tensor
+    steps: tuple[int, int, int, int]
     weights: Tensor
     inside: Tensor
+
+    def of(self, edges: Tensor) -> Samples:
+        """Those of some edges: mask [E] or indices."""
+        n_edges, cells = self.inside.shape
+        return Samples(
+            self.source[edges],
+            self.place[edges],
+            self.first.view(n_edges, cells)[edges].flatten(),
+            self.steps,
+            self.weights.view(4, n_edges, cells)[:, edges].flatten(1),
+            self.inside[edges],
+        )
 
 
 def edges_used(ii: Tensor, jj: Tensor, min_gap: int) -> Tensor:
@@ -60,80 +80,137 @@ def edges_used(ii: Tensor, jj: Tensor, min_gap: int) -> Tensor:
     return (ii - jj).abs() >= min_gap
 
 
-def make_samples(coords: Tensor, valid: Tensor, ii: Tensor, jj: Tensor) -> Samples:
+def project(
+    T_cw: Tensor, disps: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor
+) -> tuple[Tensor, Tensor]:
+    """What `droidw.geometry.projective.reproject` gives, x and y apart, which is cheaper here.
+
+    Args:
+        T_cw: [N,7]. disps: [N,h,w]. intrinsics: [4] of the grid. ii, jj: [E].
+    Returns:
+        xy [E,2,P] in cells, and valid [E,P], not too near the camera.
+    """
+    h, w = disps.shape[1:]
+    fx, fy, cx, cy = intrinsics.to(T_cw.dtype).unbind()
+    o, one = torch.zeros_like(fx), torch.ones_like(fx)
+    K = torch.stack([fx, o, cx, o, fy, cy, o, o, one]).view(3, 3)
+    K_inv = torch.stack([1 / fx, o, -cx / fx, o, 1 / fy, -cy / fy, o, o, one]).view(3, 3)
+    G = relative_pose(T_cw, ii, jj)
+    turn = (K @ se3.rotation(G) @ K_inv).to(disps.dtype)
+    shift = (G[:, :3] @ K.T).to(disps.dtype)
+    pixels = pixel_grid(h, w, disps.dtype, disps.device).view(-1, 2).T
+    pixels = torch.cat([pixels, torch.ones_like(pixels[:1])])
+    points = (turn.view(-1, 3) @ pixels).view(len(ii), 3, h * w)
+    points.addcmul_(shift[:, :, None], disps.flatten(1).index_select(0, ii)[:, None])
+    near = points[:, 2]
+    scale = near.clamp_min(NEAR).reciprocal_()
+    return points[:, :2] * scale[:, None], near >= NEAR
+
+
+def make_samples(xy: Tensor, valid: Tensor, width: int, ii: Tensor, jj: Tensor) -> Samples:
     """Samples of the cells of frames ii in frames jj.
 
     Args:
-        coords: [E,h,w,2] place in j, cells, x then y. valid: [E,h,w] bool.
-        ii, jj: [E] rows of the frames in a stack [K,h,w].
+        xy: [E,2,P] place in j, cells, row of x then row of y; may hold NaN.
+        valid: [E,P] bool. width: of the grid; P is a multiple of it.
+        ii, jj: [E] rows of the frames in a stack [K,P].
     """
-    height, width = coords.shape[1:3]
-    x, y = coords.flatten(1, 2).unbind(-1)
-    inside = valid.flatten(1) & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    x = torch.nan_to_num(x).clamp(0, width - 1)
-    y = torch.nan_to_num(y).clamp(0, height - 1)
+    height = xy.shape[2] // width
+    least = xy.new_zeros(2, 1)
+    most = xy.new_tensor([[width - 1.0], [height - 1.0]])
+    place = xy.clamp(least, most)
+    within = place == xy  # what the clamp changes is outside; NaN equals nothing
+    inside = within[:, 0] & within[:, 1] & valid
+    place.nan_to_num_()
     # The last row and column are reached with weight 1 from their left and upper neighbour.
-    left = x.floor().clamp_(max=max(width - 2, 0))
-    top = y.floor().clamp_(max=max(height - 2, 0))
-    a, b = x - left, y - top
-    first = (top * width + left).to(torch.int32) + (jj * (height * width)).to(torch.int32)[:, None]
+    corner = place.floor().minimum((most - 1).clamp_min_(0))
+    a, b = (place - corner).unbind(1)
+    left, top = corner.unbind(1)
+    first = torch.add(left, top, alpha=width).long().add_((jj * xy.shape[2])[:, None])
     right, below = (1 if width > 1 else 0), (width if height > 1 else 0)
-    steps = first.new_tensor([0, right, below, below + right])
-    ab = a * b
-    weights = torch.stack([1 - a - b + ab, a - ab, b - ab, ab], dim=-1)
-    corners = (first[..., None] + steps).view(-1, 4)
-    return Samples(ii, corners, weights.view(-1, 4), inside)
+    weights = xy.new_empty(4, *a.shape)
+    torch.mul(a, b, out=weights[3])
+    torch.sub(b, weights[3], out=weights[2])
+    torch.sub(a, weights[3], out=weights[1])
+    torch.sub(1.0 - a, weights[2], out=weights[0])
+    return Samples(
+        ii, place, first.flatten(), (0, right, below, below + right), weights.flatten(1), inside
+    )
 
 
 def interpolate(table: Tensor, samples: Samples) -> Tensor:
     """Bilinear values [E,P] of a stack [K,P]."""
-    found = table.flatten().index_select(0, samples.corners.flatten()).view(-1, 4)
-    return (found * samples.weights).sum(1).view(samples.inside.shape)
+    flat = table.flatten()
+    found = flat.index_select(0, samples.first).mul_(samples.weights[0])
+    for step, weight in zip(samples.steps[1:], samples.weights[1:], strict=True):
+        # The same index into a shifted view: the neighbour.
+        found.addcmul_(flat[step:].index_select(0, samples.first), weight)
+    return found.view(samples.inside.shape)
 
 
 def scatter(values: Tensor, samples: Samples, frames: int) -> Tensor:
     """The adjoint of `interpolate`: spread values [E,P] onto a stack [K,P] of `frames` frames."""
-    cells = samples.inside.shape[1]
-    spread = (samples.weights * values.reshape(-1, 1)).flatten()
-    out = values.new_zeros(frames * cells)
-    return out.index_add_(0, samples.corners.flatten(), spread).view(frames, cells)
+    flat = values.flatten()
+    out = values.new_zeros(frames * samples.inside.shape[1])
+    for step, weight in zip(samples.steps, samples.weights, strict=True):
+        out[step:].scatter_add_(0, samples.first, flat * weight)
+    return out.view(frames, -1)
 
 
-def similarity(features: Tensor, samples: Samples) -> Tensor:
+def similarity(features: Tensor, samples: Samples, lengths: Tensor | None = None) -> Tensor:
     """Cosine [E,P] between the feature of the cell and the interpolated one, in [-1,1].
 
     Args:
         features: [K,P,C], raw; the interpolated vector is normalised, not its neighbours.
+        lengths: [K,P] of the features, if they are known.
     """
     n_edges, cells = samples.inside.shape
     channels = features.shape[2]
     table = features.reshape(-1, channels)
-    weights = samples.weights.to(features.dtype)
-    found = features.new_empty(n_edges, cells)
-    step = n_edges if features.is_cuda else max(_CHUNK // (cells * channels), 1)
-    for start in range(0, n_edges, step):
-        part = slice(start, min(start + step, n_edges))
-        rows = slice(part.start * cells, part.stop * cells)
-        here = features.index_select(0, samples.source[part])
+    if lengths is None:
+        lengths = features.norm(dim=2)
+    first, steps = samples.first.to(torch.int32), samples.first.new_tensor(samples.steps).int()
+    ones = features.new_ones(channels)
+    dot, square = features.new_empty(2, n_edges * cells).unbind()
+    group = n_edges if features.is_cuda else max(_CHUNK // (cells * channels), 1)
+    sources = samples.source.tolist()
+    weights = features.new_empty(min(group, n_edges) * cells, 4)
+    product = features.new_empty(min(group, n_edges) * cells, channels)
+    for start in range(0, n_edges, group):
+        edges = sources[start : start + group]
+        count = len(edges) * cells
+        rows = slice(start * cells, start * cells + count)
+        weights[:count].copy_(samples.weights[:, rows].T)
         # A weighted embedding bag is a bilinear gather that never stores the four neighbours.
         there: Tensor = F.embedding_bag(
-            samples.corners[rows], table, mode="sum", per_sample_weights=weights[rows]
-        ).view(-1, cells, channels)
-        length = here.norm(dim=2) * there.norm(dim=2)
-        dot = here.mul_(there).sum(dim=2)
-        found[part] = dot / (length + _EPSILON)
-    return found
+            first[rows, None] + steps, table, mode="sum", per_sample_weights=weights[:count]
+        )
+        for k, source in enumerate(edges):
+            part = slice(k * cells, (k + 1) * cells)
+            torch.mul(there[part], features[source], out=product[part])
+        # Sums over channels as products with ones, which are several times faster.
+        torch.mv(product[:count], ones, out=dot[rows])
+        torch.mv(there.mul_(there), ones, out=square[rows])
+    length = lengths.index_select(0, samples.source).flatten() * square.sqrt_()
+    return dot.div_(length.add_(_EPSILON)).view(n_edges, cells)
 
 
-def residual(cosine: Tensor, samples: Samples, threshold: float) -> Tensor:
-    """`1 - s` with s the cosine clamped to [0,1], and 0 unless it exceeds the threshold.
+def residual(
+    cosine: Tensor, samples: Samples, threshold: float = 0.5, floor: float = 0.0
+) -> Tensor:
+    """`1 - s` with s the cosine clamped to [floor,1], and 0 unless it exceeds the threshold.
 
+    Args:
+        cosine: [E,P].
+        threshold: a cosine up to here is no similarity; -1 lets all be.
+        floor: cosines below count as this; -1 lets all be.
     Returns:
         [E,P]; 0 for pairs that are not inside, so that they take no part.
     """
-    kept = cosine.clamp(0.0, 1.0)
-    rho = 1.0 - torch.where(kept > threshold, kept, torch.zeros_like(kept))
-    return rho * samples.inside
+    kept = cosine.clamp(floor, 1.0)
+    if threshold > floor:
+        kept.masked_fill_(kept <= threshold, 0.0)
+    return (1.0 - kept).mul_(samples.inside)
 
 
 def pair_energy(u: Tensor, rho: Tensor, samples: Samples, decoupled: bool = True) -> Tensor:
@@ -151,26 +228,30 @@ def pair_gradient(
     u: Tensor, rho: Tensor, samples: Samples, decoupled: bool = True
 ) -> tuple[Tensor, Tensor]:
     """Gradient [K,P] of `pair_energy` with respect to u, and the energy itself (a scalar)."""
-    here = u[samples.source]
+    here = u.index_select(0, samples.source)
     if not decoupled:
         energy = rho / (here * here)
         return torch.zeros_like(u).index_add_(0, samples.source, -2 * energy / here), energy.sum()
     there = interpolate(u, samples)
-    energy = rho / (here * there)
-    gradient = scatter(-energy / there, samples, u.shape[0])
-    return gradient.index_add_(0, samples.source, -energy / here), energy.sum()
+    energy = (rho / here).div_(there)
+    gradient = scatter((energy / there).neg_(), samples, u.shape[0])
+    total = energy.sum()
+    return gradient.index_add_(0, samples.source, energy.div_(here), alpha=-1), total
 
 
 def frame_gradient(
-    pair: Tensor, u: Tensor, counts: Tensor, gamma_data: float, gamma_prior: float
+    pair: Tensor, u: Tensor, counts: Tensor | None, gamma_data: float, gamma_prior: float
 ) -> Tensor:
     """J of REFERENCE 4.3: the pair gradient per edge of the frame, plus that of the prior.
 
     Because every frame has its own factor, this is not the gradient of one scalar energy.
 
     Args:
-        pair, u: [K,h,w]. counts: [K] number of edges in which a frame takes part.
+        pair, u: [K,h,w]. counts: [K] number of edges in which a frame takes part; None: not
+            divided, as the paper writes it, and then it is the gradient of one energy.
     """
+    if counts is None:
+        return gamma_data * pair + gamma_prior / (u + 1.0)
     share = gamma_data / (counts.to(u.dtype) + _EPSILON)
     return share[:, None, None] * pair + gamma_prior / (u + 1.0)
 
@@ -178,11 +259,10 @@ def frame_gradient(
 def softplus(y: Tensor, offset: float) -> Tensor:
     """`log(1 + offset + e^y)`: the published map from y to uncertainty (paper: offset 0)."""
     # log(1 + offset) + log(1 + e^(y - log(1 + offset))), which does not overflow
-    shift = torch.log1p(torch.tensor(offset, dtype=torch.float64)).item()
-    return shift + F.softplus(y - shift)
+    shift = math.log1p(offset)
+    return F.softplus(y - shift).add_(shift)
 
 
 def softplus_slope(y: Tensor, offset: float) -> Tensor:
     """Derivative of `softplus`: `1 / (1 + (1 + offset) e^-y)`."""
-    shift = torch.log1p(torch.tensor(offset, dtype=torch.float64)).item()
-    return torch.sigmoid(y - shift)
+    return torch.sigmoid(y - math.log1p(offset))

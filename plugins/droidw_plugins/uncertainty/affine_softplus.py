@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from droidw.plugin.component import BuildContext, Component
+from droidw_plugins.uncertainty._options import ObjectiveOptions
 
 if TYPE_CHECKING:
     from droidw.interfaces.uncertainty import UncertaintyModel
@@ -14,19 +15,13 @@ __all__ = ["COMPONENT", "AffineSoftplusOptions"]
 
 
 @dataclass(frozen=True)
-class AffineSoftplusOptions:
+class AffineSoftplusOptions(ObjectiveOptions):
     """Options of `affine-softplus`; the defaults are the published values (REFERENCE 4.3)."""
 
     lr: float = field(default=0.1, metadata={"help": "step of gradient descent", "ge": 0})
     weight_decay: float = field(
         default=0.002,
         metadata={"help": "share of the parameters that is lost per step", "ge": 0, "lt": 1},
-    )
-    gamma_data: float = field(
-        default=0.1, metadata={"help": "weight of the consistency loss", "ge": 0}
-    )
-    gamma_prior: float = field(
-        default=0.05, metadata={"help": "weight of the prior log(u + 1)", "ge": 0}
     )
     softplus_offset: float = field(
         default=0.1,
@@ -40,27 +35,6 @@ class AffineSoftplusOptions:
             "the same u, below the gate",
             "ge": 0,
         },
-    )
-    min_gap: int = field(
-        default=2, metadata={"help": "keyframes between the ends of an edge that counts", "ge": 1}
-    )
-    similarity_threshold: float = field(
-        default=0.5,
-        metadata={"help": "a cosine up to here counts as no similarity at all", "ge": 0, "lt": 1},
-    )
-    decoupled: bool = field(
-        default=True,
-        metadata={"help": "share the loss between both frames of an edge; false: 1/u_i^2"},
-    )
-    affine: bool = field(
-        default=True,
-        metadata={"help": "map features to u; false: a free u per cell, in [u_min, u_max]"},
-    )
-    u_min: float = field(default=0.1, metadata={"help": "smallest u where not affine", "gt": 0})
-    u_max: float = field(default=2.0, metadata={"help": "largest u where not affine", "gt": 0})
-    refresh: int = field(
-        default=1,
-        metadata={"help": "similarities are renewed at every n-th step on the same edges", "ge": 1},
     )
 
 

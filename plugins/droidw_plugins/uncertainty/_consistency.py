@@ -1,0 +1,205 @@
+"""What the learned models share: features as rows, pairs of cells, and the gradient of the loss."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from droidw.errors import ConfigError
+from droidw.interfaces.uncertainty import StoreField, UncertaintyReport, UncertaintyView
+from droidw_plugins.uncertainty import _objective as objective
+from droidw_plugins.uncertainty._options import ObjectiveOptions
+
+__all__ = ["Consistency"]
+
+_ROWS = "consistency_rows"
+_LENGTHS = "consistency_lengths"
+_SERIAL = "consistency_serial"
+
+
+@dataclass
+class _Pairs:
+    """Samples and residuals of one set of edges, kept for `refresh` steps.
+
+    `first` and `last` bound the keyframes that take part; rows count from `first`.
+    """
+
+    ii: Tensor
+    jj: Tensor
+    first: int
+    last: int
+    counts: Tensor
+    samples: objective.Samples
+    rho: Tensor
+    inside: int
+    similar: int
+    age: int = 0
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """Similarities of earlier edges: places [M,2,P], cosines [M,P], and the row of each edge."""
+
+    places: Tensor
+    cosines: Tensor
+    row: dict[tuple[int, int], int]
+
+
+class Consistency:
+    """The consistency objective over views: keeps what does not change from step to step.
+
+    Args:
+        options: of the objective.
+        device: of the run.
+        name: of the model, for messages.
+    Attributes:
+        fields: on a CPU the features a second time with the channels last [h,w,c], and their
+            lengths [h,w]: bringing a window into that order at every step would cost more than
+            the step. With `tolerance` also a serial number of the keyframe.
+    """
+
+    def __init__(self, options: ObjectiveOptions, device: torch.device, name: str) -> None:
+        self.options = options
+        self._name = name
+        self._pairs: _Pairs | None = None
+        self._taken: _Taken | None = None
+        self._ordered = device.type == "cpu"
+        fields: list[StoreField] = []
+        if self._ordered:
+            fields += [StoreField(_ROWS, ("h", "w", "c")), StoreField(_LENGTHS, ("h", "w"))]
+        if options.tolerance > 0:
+            fields.append(StoreField(_SERIAL, (), dtype="int64"))
+        self.fields = tuple(fields)
+
+    def append(self, view: UncertaintyView, index: int) -> None:
+        """Prepare the features of a new keyframe.
+
+        Raises:
+            ConfigError: there are no features.
+        """
+        if view.features.shape[1] == 0:
+            raise ConfigError(
+                f"uncertainty.name: '{self._name}' needs features, but the feature extractor "
+                "gives none",
+                "choose an extractor, e.g. features=cnn, or switch both off: uncertainty=none",
+            )
+        self._pairs = None  # `index` may have meant another keyframe until now
+        if self._ordered:
+            rows = view.features[index].movedim(0, -1).float()
+            view.fields[_ROWS][index] = rows
+            view.fields[_LENGTHS][index] = rows.norm(dim=2)
+        if self.options.tolerance > 0:
+            serials = view.fields[_SERIAL]
+            number = int(serials[:index].max()) + 1 if index else 1
+            serials[index] = number
+            if self._taken is not None:
+                row = {k: at for k, at in self._taken.row.items() if max(k) < number}
+                self._taken = _Taken(self._taken.places, self._taken.cosines, row)
+
+    def forget(self) -> None:
+        """Drop all that was kept from earlier steps."""
+        self._pairs = self._taken = None
+
+    def rows(self, view: UncertaintyView, first: int, last: int) -> Tensor:
+        """Features of a range of keyframes as float32 rows [n,P,C]; a view on a CPU."""
+        if self._ordered:
+            return view.fields[_ROWS][first:last].flatten(1, 2)
+        return view.features[first:last].flatten(2).transpose(1, 2).float()
+
+    def gradient(self, view: UncertaintyView) -> tuple[Tensor, UncertaintyReport]:
+        """J [F,h,w] of REFERENCE 4.3 for the F frames of the view, and the facts of the step.
+
+        Returns:
+            J, and a report of the mean pair energy, and as facts: `pairs`, and `similar`, the
+            share of pairs above the threshold.
+        """
+        options = self.options
+        pairs = self._pairs_of(view)
+        u = view.uncertainty[pairs.first : pairs.last]
+        pair, energy = objective.pair_gradient(
+            u.flatten(1), pairs.rho, pairs.samples, options.decoupled
+        )
+        counts = pairs.counts if options.average else None
+        full = objective.frame_gradient(
+            pair.view(u.shape), u, counts, options.gamma_data, options.gamma_prior
+        )
+        facts = {"pairs": float(pairs.inside), "similar": pairs.similar / max(pairs.inside, 1)}
+        report = UncertaintyReport(float(energy) / max(pairs.inside, 1), facts)
+        return full[view.frames - pairs.first], report
+
+    def share(self, gradient: Tensor) -> float:
+        """What the gradient [F,P] of a parameter is multiplied with: a mean, or 1 for the sum."""
+        return 1.0 / gradient.numel() if self.options.average else 1.0
+
+    def _pairs_of(self, view: UncertaintyView) -> _Pairs:
+        kept = self._pairs
+        if (
+            kept is not None
+            and kept.age + 1 < self.options.refresh
+            and torch.equal(kept.ii, view.ii)
+            and torch.equal(kept.jj, view.jj)
+            and kept.first <= int(view.frames.min())
+            and kept.last > int(view.frames.max())
+        ):
+            kept.age += 1
+            return kept
+        options = self.options
+        used = objective.edges_used(view.ii, view.jj, options.min_gap)
+        ii, jj = view.ii[used], view.jj[used]
+        touched = torch.cat([ii, jj, view.frames])
+        first, last = int(touched.min()), int(touched.max()) + 1
+        counts = torch.bincount(torch.cat([ii, jj]) - first, minlength=last - first)
+        xy, valid = objective.project(view.T_cw, view.disps, view.intrinsics, ii, jj)
+        samples = objective.make_samples(xy, valid, view.disps.shape[2], ii - first, jj - first)
+        if options.tolerance > 0:
+            cosine = self._renewed(view, samples, ii, jj, first, last)
+        else:
+            cosine = self._similarity(view, samples, first, last)
+        rho = objective.residual(
+            cosine, samples, options.similarity_threshold, options.similarity_floor
+        )
+        inside = int(samples.inside.sum())
+        similar = inside - int((rho == 1).sum())
+        self._pairs = _Pairs(
+            view.ii.clone(), view.jj.clone(), first, last, counts, samples, rho, inside, similar
+        )
+        return self._pairs
+
+    def _similarity(
+        self, view: UncertaintyView, samples: objective.Samples, first: int, last: int
+    ) -> Tensor:
+        lengths = view.fields[_LENGTHS][first:last].flatten(1) if self._ordered else None
+        return objective.similarity(self.rows(view, first, last), samples, lengths)
+
+    def _renewed(
+        self,
+        view: UncertaintyView,
+        samples: objective.Samples,
+        ii: Tensor,
+        jj: Tensor,
+        first: int,
+        last: int,
+    ) -> Tensor:
+        """Cosines [E,P], taken again only for edges that moved by more than `tolerance`."""
+        serials = view.fields[_SERIAL]
+        keys = list(zip(serials[ii].tolist(), serials[jj].tolist(), strict=True))
+        cosine = samples.place.new_empty(samples.inside.shape)
+        places = samples.place.clone()
+        moved = torch.ones(len(keys), dtype=torch.bool, device=cosine.device)
+        taken = self._taken
+        if taken is not None:
+            known = [n for n, key in enumerate(keys) if key in taken.row]
+            at = torch.tensor([taken.row[keys[n]] for n in known], device=cosine.device).long()
+            here = torch.tensor(known, device=cosine.device).long()
+            old = taken.places[at]
+            moved[here] = (samples.place[here] - old).abs_().mean((1, 2)) > (
+                0.5 * self.options.tolerance
+            )
+            cosine[here] = taken.cosines[at]
+            places[here] = torch.where(moved[here][:, None, None], places[here], old)
+        if bool(moved.any()):
+            cosine[moved] = self._similarity(view, samples.of(moved), first, last)
+        self._taken = _Taken(places, cosine, {key: n for n, key in enumerate(keys)})
+        return cosine
