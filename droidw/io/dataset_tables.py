@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -96,6 +96,7 @@ class DatasetTable:
         name: as in `name:sequence`.
         title, page, reference, licence: for people.
         sequences: by name.
+        told: the table as it stands in the file.
     """
 
     name: str
@@ -104,6 +105,15 @@ class DatasetTable:
     reference: str
     licence: str
     sequences: Mapping[str, KnownSequence]
+    told: Mapping[str, Any] = field(default_factory=dict, repr=False)
+
+    def like_others(self, name: str) -> KnownSequence:
+        """A row for a sequence that the table has not, with what it says of all.
+
+        It has a camera only where one camera took the whole dataset.
+        """
+        row = _sequence(self.name, name, self.told, {})
+        return row if self.told.get("one_camera") else replace(row, camera={})
 
     def sequence(self, name: str) -> KnownSequence:
         """The sequence of that name, or of one that it also has.
@@ -151,6 +161,7 @@ def load_table(name: str) -> DatasetTable:
         reference=told["reference"],
         licence=told["licence"],
         sequences={key: _sequence(name, key, told, row or {}) for key, row in rows.items()},
+        told=told,
     )
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from droidw.testing.conformance import check_dataset_reader
-from droidw_plugins.datasets import folder, tum, video
+from droidw_plugins.datasets import bonn, droidw, dycheck, folder, tum, video
 
 
 def pictures(path, count=8):
@@ -30,3 +30,16 @@ def test_tum(tmp_path):
 
 def test_video(videos, tmp_path):
     check_dataset_reader(video.COMPONENT, str(videos.write_video(tmp_path / "clip.mp4", count=8)))
+
+
+def test_named_datasets(trees, data):
+    trees.rgbd(data / "Bonn" / "rgbd_bonn_balloon", count=8)
+    trees.rgbd(data / "TUM_RGBD" / "rgbd_dataset_freiburg3_walking_xyz", count=8)
+    trees.dycheck(data / "DyCheck" / "apple", numbers=range(8))
+    trees.walk(data / "DROID-W" / "downtown1", count=8)
+    trees.clip(data / "YouTube" / "giraffe", numbers=range(8))
+    check_dataset_reader(bonn.COMPONENT, "bonn:balloon")
+    check_dataset_reader(tum.COMPONENT, "tum:f3/wx")
+    check_dataset_reader(dycheck.COMPONENT, "dycheck:apple")
+    check_dataset_reader(droidw.COMPONENT, "droidw:downtown1")
+    check_dataset_reader(droidw.COMPONENT, "youtube:giraffe")

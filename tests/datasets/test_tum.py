@@ -86,3 +86,31 @@ def test_it_runs_without_truth(reader, tmp_path):
     source = reader.open(str(folder), Selection())
     assert source.truth is None
     assert len(list(source.frames())) == 2
+
+
+def test_by_name_and_its_short_form(reader, trees, data):
+    trees.rgbd(data / "TUM_RGBD" / "rgbd_dataset_freiburg3_walking_xyz", size=(640, 480), count=2)
+    for name in ("tum:freiburg3_walking_xyz", "tum:f3/wx"):
+        assert reader.recognises(name)
+        source = reader.open(name, Selection())
+        assert source.camera.fx == 535.4 and source.name == "tum-freiburg3_walking_xyz"
+    trees.rgbd(data / "TUM_RGBD" / "rgbd_dataset_freiburg1_desk", size=(640, 480), count=2)
+    assert reader.open("tum:freiburg1_desk", Selection()).camera.fx == 517.3
+    with pytest.raises(InputError, match="has no sequence 'f3/w'"):
+        reader.open("tum:f3/w", Selection())
+
+
+def test_the_table_has_the_cameras_that_go_by_the_name():
+    from droidw.io.dataset_tables import load_table
+    from droidw_plugins.datasets._tum import _published_camera
+
+    for row in load_table("tum").sequences.values():
+        assert row.raw_camera() == _published_camera(row.name, (640, 480), [])
+
+
+def test_published_pictures_under_compat(context, trees, data):
+    trees.rgbd(data / "TUM_RGBD" / "rgbd_dataset_freiburg3_sitting_xyz", count=9, rate=100.0)
+    published = COMPONENT.factory(TumOptions(), context(published=True))
+    source = published.open("tum:freiburg3_sitting_xyz", Selection())
+    times = [f.time - trees.START for f in source.frames()]
+    np.testing.assert_allclose(times, np.arange(0, 9, 2) / 100, atol=2e-5)

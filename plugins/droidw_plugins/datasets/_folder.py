@@ -12,8 +12,6 @@ from droidw.interfaces.datasets import Selection
 from droidw.io.calib import read_calibration
 from droidw.io.images import IMAGE_SUFFIXES, list_images
 from droidw.io.notes import Notes
-from droidw.io.tum import read_tum
-from droidw.slam.frame import Trajectory
 from droidw_plugins.datasets._layout import VIDEO_SUFFIXES, looks_like_tum
 from droidw_plugins.datasets._listing import (
     Entry,
@@ -21,8 +19,10 @@ from droidw_plugins.datasets._listing import (
     keep_rising,
     read_listing,
 )
+from droidw_plugins.datasets._named import existing_folder
+from droidw_plugins.datasets._truth import read_truth
 
-__all__ = ["FolderReader", "existing_folder", "read_truth"]
+__all__ = ["FolderReader"]
 
 _SUBFOLDERS = ("rgb", "images")
 _EXPECTED = (
@@ -87,22 +87,6 @@ class FolderReader:
         return [(n, n / self._fps, file) for n, file in enumerate(files)]
 
 
-def existing_folder(source: str, expected: str) -> Path:
-    """The folder `source`; `expected` is the hint of the error.
-
-    Raises:
-        InputError: it is not there or no folder.
-    """
-    path = Path(source)
-    if not source:
-        raise InputError("no folder was given", expected)
-    if not path.exists():
-        raise InputError(f"{source}: no such folder", expected)
-    if not path.is_dir():
-        raise InputError(f"{source} is not a folder", expected)
-    return path
-
-
 def _picture_folder(path: Path) -> Path | None:
     """The folder itself or the one in it that has the pictures."""
     for folder in (path, *(path / name for name in _SUBFOLDERS)):
@@ -122,14 +106,3 @@ def _times_in_names(files: list[Path]) -> list[float] | None:
     rising = sorted(times)
     gaps = [b - a for a, b in pairwise(rising)]
     return times if min(gaps) > 0 and 0.001 <= median(gaps) <= 2.0 else None
-
-
-def read_truth(path: Path, problems: list[str]) -> Trajectory | None:
-    """Ground truth if there is a usable one; it is only scored, so that no fault is fatal."""
-    if not path.is_file():
-        return None
-    try:
-        return read_tum(path, problems=problems)
-    except InputError as error:
-        problems.append(f"{error.message}; the run is not scored")
-        return None

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
-from droidw.errors import InputError
 from droidw.geometry.camera import Camera
 from droidw.interfaces.datasets import Selection
-from droidw.io.notes import Notes
-from droidw.slam.frame import Trajectory
-from droidw_plugins.datasets._folder import existing_folder, read_truth
 from droidw_plugins.datasets._layout import looks_like_tum
-from droidw_plugins.datasets._listing import Entry, ListedSource, keep_rising, read_listing
+from droidw_plugins.datasets._listing import ListedSource
+from droidw_plugins.datasets._named import Datasets
+from droidw_plugins.datasets._rgbd import EXPECTED, open_rgbd
 
 __all__ = ["TumReader"]
-
-_EXPECTED = "expected rgb.txt with lines `timestamp filename`, and the folder rgb/ that it names"
 
 # Colour cameras of the benchmark as its authors publish them: fx fy cx cy, k1 k2 p1 p2 k3.
 # The pictures of freiburg3 are undistorted already.
@@ -36,31 +29,24 @@ class TumReader:
 
     Args:
         max_difference: a true pose belongs to a picture if it is this near in time, in s.
+        datasets: where named sequences lie.
     """
 
-    def __init__(self, max_difference: float = 0.02) -> None:
+    def __init__(self, max_difference: float, datasets: Datasets) -> None:
         self._max_difference = max_difference
+        self._datasets = datasets
 
     def recognises(self, source: str) -> bool:
-        """Whether it is a folder in the layout of the download."""
+        """Whether it is `tum:...` or a folder in the layout of the download."""
         path = Path(source)
-        return bool(source) and path.is_dir() and looks_like_tum(path)
+        named = Datasets.names(source, "tum")
+        return named or (bool(source) and path.is_dir() and looks_like_tum(path))
 
     def open(self, source: str, selection: Selection) -> ListedSource:
         """Open the sequence; see `DatasetReader.open`."""
-        path = existing_folder(source, _EXPECTED)
-        if not (path / "rgb.txt").is_file():
-            raise InputError(f"{path} has no rgb.txt", _EXPECTED)
-        problems: list[str] = []
-        notes = Notes(problems)
-        entries = keep_rising(read_listing(path / "rgb.txt", notes), notes)
-        notes.finish()
-        name = path.resolve().name
-        out = ListedSource(name, entries, selection, problems, notes.skipped)
-        out.camera = _published_camera(name, out.size, problems)
-        truth = read_truth(path / "groundtruth.txt", problems)
-        if truth is not None:
-            out.truth = _nearest(truth, entries, self._max_difference, problems)
+        place = self._datasets.locate(source, "tum", EXPECTED)
+        out = open_rgbd(place, selection, self._max_difference, published=self._datasets.published)
+        out.camera = _published_camera(place.folder.resolve().name, out.size, out.problems)
         return out
 
 
@@ -78,24 +64,3 @@ def _published_camera(name: str, size: tuple[int, int], problems: list[str]) -> 
         f"camera: the published calibration of freiburg{match[1]}, taken by the folder's name"
     )
     return Camera(*_SIZE, *four, distortion=bent, model="opencv" if bent else "pinhole")
-
-
-def _nearest(
-    truth: Trajectory, entries: Sequence[Entry], max_difference: float, problems: list[str]
-) -> Trajectory | None:
-    """The true pose nearest in time to each picture, where one is near enough."""
-    times = np.array([time for _, time, _ in entries])
-    right = np.searchsorted(truth.times, times).clip(0, len(truth) - 1)
-    left = (right - 1).clip(0)
-    before = np.abs(truth.times[left] - times) < np.abs(truth.times[right] - times)
-    best = np.where(before, left, right)
-    near = np.abs(truth.times[best] - times) <= max_difference
-    if not near.all():
-        problems.append(
-            f"{int((~near).sum())} of {len(near)} pictures have no true pose within "
-            f"{max_difference:g} s"
-        )
-    chosen = np.unique(best[near])
-    if not len(chosen):
-        return None
-    return Trajectory(truth.times[chosen], truth.T_wc[chosen])

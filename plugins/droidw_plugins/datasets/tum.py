@@ -29,14 +29,15 @@ class TumOptions:
 
 
 def _make(options: TumOptions, context: BuildContext) -> DatasetReader:
+    from droidw_plugins.datasets._named import Datasets
     from droidw_plugins.datasets._tum import TumReader
 
-    return TumReader(options.max_difference)
+    return TumReader(options.max_difference, Datasets.of(context))
 
 
 COMPONENT: Component[DatasetReader] = Component(
     name="tum",
-    summary="TUM RGB-D benchmark sequence (rgb.txt, groundtruth.txt), colour pictures only",
+    summary="TUM RGB-D benchmark (tum:freiburg3_walking_xyz, or its folder), colour pictures only",
     factory=_make,
     options=TumOptions,
     reference="Sturm et al., IROS 2012; data CC BY 4.0",
