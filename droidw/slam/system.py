@@ -324,6 +324,9 @@ class SlamSystem:
 
 
 def _nbytes(payload: object) -> int:
-    """Bytes of the arrays and tensors that a payload holds directly."""
-    values = payload if isinstance(payload, (list, tuple)) else vars(payload).values()
+    """Bytes of the arrays and tensors that a payload is or holds directly."""
+    if isinstance(payload, (list, tuple)):
+        values: Iterable[object] = payload
+    else:
+        values = (payload, *getattr(payload, "__dict__", {}).values())
     return sum(int(getattr(value, "nbytes", 0)) for value in values)

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import zlib
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 import torch
 
-from droidw.geometry.camera import Grid
+import droidw
+from droidw.config.load import load_config
+from droidw.config.resolve import resolve
+from droidw.geometry.camera import Camera, Grid
 from droidw.geometry.projective import pixel_grid
-from droidw.interfaces.correspondence import EdgeRequest
+from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate, Motion
+from droidw.plugin.component import BuildContext
 from droidw.slam.frame import Frame
+from droidw.slam.optimise import Parts
+from droidw.slam.system import SlamSystem
+from droidw.solve.problem import Report, Step
 from droidw.testing.scenes import Scene, SceneSpec
 from droidw_plugins.correspondence._droid import DroidCorrespondence
 from droidw_plugins.correspondence._droid_net import DroidNet
@@ -99,3 +107,90 @@ def encoded(frames, grid):
         return [part.context(part.encode(f, grid), f, grid) for f in frames]
 
     return encode
+
+
+COUNT = 30
+BASE = [
+    "features=none", "depth=none", "uncertainty=none", "correspondence=synthetic", "ba=torch",
+    "motion_filter.threshold=0.5",
+]  # fmt: skip
+
+
+class Counted:
+    """Correspondence that agrees with geometry and notes every update of every session.
+
+    Attributes:
+        log: (purpose, number of the session, edges). enlarged: (node, map).
+    """
+
+    stride, offset = 8, 0.0
+
+    def __init__(self):
+        self.log, self.enlarged, self.sessions = [], [], 0
+
+    def encode(self, frame, grid):
+        return frame.index
+
+    def context(self, payload, frame, grid):
+        return payload
+
+    def motion(self, reference, current):
+        return Motion(1.0, 1.0)
+
+    def session(self, purpose="window"):
+        self.sessions += 1
+        return CountedSession(self, (purpose, self.sessions))
+
+
+@dataclass
+class CountedSession:
+    owner: Counted
+    name: tuple
+    known: set = field(default_factory=set)
+
+    def update(self, request):
+        edges = tuple(zip(request.ii, request.jj, strict=True))
+        self.owner.log.append((*self.name, edges))
+        self.known |= set(request.ids)
+        return EdgeUpdate(request.coords.clone(), torch.ones_like(request.coords))
+
+    def forget(self, ids):
+        self.known -= set(ids)
+
+    def upsample(self, node, disp):
+        self.owner.enlarged.append((node, disp.clone()))
+        return disp.repeat_interleave(8, 0).repeat_interleave(8, 1)
+
+
+class Holds:
+    """Bundle adjustment that moves nothing, unless told to."""
+
+    def __init__(self):
+        self.factor = 1.0
+
+    def step(self, problem):
+        return Step(problem.T_cw.clone(), problem.disps * self.factor, Report("ok", 0.0))
+
+
+@pytest.fixture
+def system_of():
+    """Build a system: `system_of("paper", "key=value", events=None)`."""
+    return build_system
+
+
+def build_system(preset, *overrides, events=None):
+    """(system, its counted correspondence, frames) of a clip of 30 frames 96x64."""
+    plugins = droidw.load_plugins(environ={})
+    resolved = resolve(load_config(preset=preset, overrides=[*BASE, *overrides]), plugins)
+    context = BuildContext(torch.device("cpu"))
+    built = {
+        slot: resolved.parts[slot][0].factory(resolved.parts[slot][1], context)
+        for slot in ("features", "depth", "uncertainty")
+    }
+    counted = Counted()
+    parts = Parts(**built, ba=Holds(), correspondence=counted)
+    camera = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
+    system = SlamSystem(resolved.config, parts, camera, torch.device("cpu"), events)
+    blank = torch.rand(3, 64, 96, generator=torch.Generator().manual_seed(0))
+    frames = [Frame(k, k / 30, blank, camera.intrinsics(), f"{k}") for k in range(COUNT)]
+    return system, counted, frames

@@ -88,9 +88,7 @@ def test_far_outside_is_nothing():
 def test_edges_worked_out_together(monkeypatch):
     h, w = 9, 8
     pyramid = Pyramid(h, w)
-    volumes = [
-        volume(features(h, w, k), pyramid.features(features(h, w, k + 1))) for k in range(5)
-    ]
+    volumes = [volume(features(h, w, k), pyramid.features(features(h, w, k + 1))) for k in range(5)]
     coords = torch.rand(5, h, w, 2) * 8
     one_by_one = lookup(volumes, coords, pyramid)
     monkeypatch.setattr(_droid_corr, "_TOGETHER", {"cpu": 3, "cuda": 3})
