@@ -65,9 +65,10 @@ DW_HD Measured<R> measure(
     m.wv = wv * ok;
     m.energy = m.wu * m.ru * m.ru + m.wv * m.rv * m.rv;
     if (huber >= S(0)) {
-        const R limit = fill<R>(huber);
+        // one over the squared residual length: infinite where the residual or the weight is 0
         const R mean = at_least(fill<R>(S(0.5)) * (m.wu + m.wv), fill<R>(Limits<S>::tiny));
-        const R knee = limit / at_least(root(m.energy / mean), limit);
+        const R share = mean / m.energy * fill<R>(huber * huber);
+        const R knee = select(share < fill<R>(S(1)), root(share), fill<R>(S(1)));
         m.wu = m.wu * knee;
         m.wv = m.wv * knee;
         m.energy = m.energy * (knee * (fill<R>(S(2)) - knee));
@@ -129,61 +130,37 @@ constexpr int HESSIAN = 21, GRADIENT = 6, POSE_SUMS = HESSIAN + GRADIENT;
 
 DW_HD constexpr int upper(int r, int c) { return r * 6 - r * (r - 1) / 2 + (c - r); }
 
-// Adds W J_j^T J_j and W J_j^T r of G numbers (packs of cells, or one cell) to POSE_SUMS sums. Each
-// sum is touched once for all of them, since there are more sums than registers.
-template <int G, class R>
-DW_HD void add_pose_sums(const Linear<R>* l, R* sums) {
-    R h[G], u2[G], u3[G], u4[G], k[G], v2[G], v3[G], v4[G];
-    for (int g = 0; g < G; ++g) {
-        h[g] = l[g].su * l[g].h;
-        u2[g] = l[g].su * l[g].u2;
-        u3[g] = l[g].su * l[g].u3;
-        u4[g] = l[g].su * l[g].u4;
-        k[g] = l[g].sv * l[g].h;
-        v2[g] = l[g].sv * l[g].v2;
-        v3[g] = l[g].sv * l[g].v3;
-        v4[g] = l[g].sv * l[g].v4;
-    }
-#define DW_ADD(at, x, y) \
-    {                    \
-        R sum = sums[at]; \
-        for (int g = 0; g < G; ++g) sum += (x) * (y); \
-        sums[at] = sum;  \
-    }
-#define DW_ADD2(at, x, y, z, w) \
-    {                           \
-        R sum = sums[at];       \
-        for (int g = 0; g < G; ++g) sum += (x) * (y) + (z) * (w); \
-        sums[at] = sum;         \
-    }
-    DW_ADD(upper(0, 0), h[g], l[g].h)
-    DW_ADD(upper(0, 2), h[g], l[g].u2)
-    DW_ADD(upper(0, 3), h[g], l[g].u3)
-    DW_ADD(upper(0, 4), h[g], l[g].u4)
-    DW_ADD(upper(0, 5), h[g], l[g].u5)
-    DW_ADD(upper(1, 1), k[g], l[g].h)
-    DW_ADD(upper(1, 2), k[g], l[g].v2)
-    DW_ADD(upper(1, 3), k[g], l[g].v3)
-    DW_ADD(upper(1, 4), k[g], l[g].v4)
-    DW_ADD(upper(1, 5), k[g], l[g].v5)
-    DW_ADD2(upper(2, 2), u2[g], l[g].u2, v2[g], l[g].v2)
-    DW_ADD2(upper(2, 3), u2[g], l[g].u3, v2[g], l[g].v3)
-    DW_ADD2(upper(2, 4), u2[g], l[g].u4, v2[g], l[g].v4)
-    DW_ADD2(upper(2, 5), u2[g], l[g].u5, v2[g], l[g].v5)
-    DW_ADD2(upper(3, 3), u3[g], l[g].u3, v3[g], l[g].v3)
-    DW_ADD2(upper(3, 4), u3[g], l[g].u4, v3[g], l[g].v4)
-    DW_ADD2(upper(3, 5), u3[g], l[g].u5, v3[g], l[g].v5)
-    DW_ADD2(upper(4, 4), u4[g], l[g].u4, v4[g], l[g].v4)
-    DW_ADD2(upper(4, 5), u4[g], l[g].u5, v4[g], l[g].v5)
-    DW_ADD2(upper(5, 5), l[g].su * l[g].u5, l[g].u5, l[g].sv * l[g].v5, l[g].v5)
-    DW_ADD(HESSIAN + 0, l[g].gu, l[g].h)
-    DW_ADD(HESSIAN + 1, l[g].gv, l[g].h)
-    DW_ADD2(HESSIAN + 2, l[g].gu, l[g].u2, l[g].gv, l[g].v2)
-    DW_ADD2(HESSIAN + 3, l[g].gu, l[g].u3, l[g].gv, l[g].v3)
-    DW_ADD2(HESSIAN + 4, l[g].gu, l[g].u4, l[g].gv, l[g].v4)
-    DW_ADD2(HESSIAN + 5, l[g].gu, l[g].u5, l[g].gv, l[g].v5)
-#undef DW_ADD
-#undef DW_ADD2
+// Adds W J_j^T J_j and W J_j^T r of a cell to POSE_SUMS sums.
+template <class R>
+DW_HD void add_pose_sums(const Linear<R>& l, R* sums) {
+    const R uh = l.su * l.h, u2 = l.su * l.u2, u3 = l.su * l.u3, u4 = l.su * l.u4;
+    const R vh = l.sv * l.h, v2 = l.sv * l.v2, v3 = l.sv * l.v3, v4 = l.sv * l.v4;
+    sums[upper(0, 0)] += uh * l.h;
+    sums[upper(0, 2)] += uh * l.u2;
+    sums[upper(0, 3)] += uh * l.u3;
+    sums[upper(0, 4)] += uh * l.u4;
+    sums[upper(0, 5)] += uh * l.u5;
+    sums[upper(1, 1)] += vh * l.h;
+    sums[upper(1, 2)] += vh * l.v2;
+    sums[upper(1, 3)] += vh * l.v3;
+    sums[upper(1, 4)] += vh * l.v4;
+    sums[upper(1, 5)] += vh * l.v5;
+    sums[upper(2, 2)] += u2 * l.u2 + v2 * l.v2;
+    sums[upper(2, 3)] += u2 * l.u3 + v2 * l.v3;
+    sums[upper(2, 4)] += u2 * l.u4 + v2 * l.v4;
+    sums[upper(2, 5)] += u2 * l.u5 + v2 * l.v5;
+    sums[upper(3, 3)] += u3 * l.u3 + v3 * l.v3;
+    sums[upper(3, 4)] += u3 * l.u4 + v3 * l.v4;
+    sums[upper(3, 5)] += u3 * l.u5 + v3 * l.v5;
+    sums[upper(4, 4)] += u4 * l.u4 + v4 * l.v4;
+    sums[upper(4, 5)] += u4 * l.u5 + v4 * l.v5;
+    sums[upper(5, 5)] += l.su * l.u5 * l.u5 + l.sv * l.v5 * l.v5;
+    sums[HESSIAN + 0] += l.gu * l.h;
+    sums[HESSIAN + 1] += l.gv * l.h;
+    sums[HESSIAN + 2] += l.gu * l.u2 + l.gv * l.v2;
+    sums[HESSIAN + 3] += l.gu * l.u3 + l.gv * l.v3;
+    sums[HESSIAN + 4] += l.gu * l.u4 + l.gv * l.v4;
+    sums[HESSIAN + 5] += l.gu * l.u5 + l.gv * l.v5;
 }
 
 // E: W J_j^T J_z of a cell, six values.

@@ -86,7 +86,7 @@ class Stepper {
     Workspace<S>& work_;
     View<S> start_;
     int threads_;
-    bool check_ = false, finite_ = true;
+    bool finite_ = true;
     double energy_ = 0, curvature_ = 0;
     Report report_{};
 
@@ -123,15 +123,13 @@ class Stepper {
     }
 
     void linearise(bool check) {
-        check_ = check;
+        start_.check = check;
         const std::vector<Unit>& units = work_.plan.units;
         parallel(int64_t(units.size()), threads_, [&](int64_t u, int thread) {
             Scratch<S>& mine = work_.scratch[thread];
             Found& found = work_.found[u];
-            if (check && p_.motion_only) linearise_unit<S, true, false>(start_, units[u], mine, found);
-            else if (check) linearise_unit<S, true, true>(start_, units[u], mine, found);
-            else if (p_.motion_only) linearise_unit<S, false, false>(start_, units[u], mine, found);
-            else linearise_unit<S, false, true>(start_, units[u], mine, found);
+            if (p_.motion_only) linearise_unit<S, false>(start_, units[u], mine, found);
+            else linearise_unit<S, true>(start_, units[u], mine, found);
         });
         energy_ = curvature_ = 0;
         double dropped = 0;
@@ -212,8 +210,7 @@ class Stepper {
         const std::vector<Unit>& units = work_.plan.units;
         std::vector<double> parts(units.size());
         parallel(int64_t(units.size()), threads_, [&](int64_t u, int) {
-            parts[u] = check_ ? energy_unit<S, true>(start_, now, moved, units[u])
-                              : energy_unit<S, false>(start_, now, moved, units[u]);
+            parts[u] = energy_unit(start_, now, moved, units[u]);
         });
         double sum = 0;
         for (const double part : parts) sum += part;
@@ -248,8 +245,7 @@ class Stepper {
             }
         const std::vector<Unit>& units = work_.plan.units;
         parallel(int64_t(units.size()), threads_, [&](int64_t u, int) {
-            if (check_) substitute_unit<S, true>(start_, units[u], steps.data());
-            else substitute_unit<S, false>(start_, units[u], steps.data());
+            substitute_unit(start_, units[u], steps.data());
         });
     }
 

@@ -5,9 +5,6 @@
 
 namespace dw {
 
-// Registers that are worked on between two looks at the sums.
-constexpr int GROUP = 1;
-
 // Cells of one measurement, as a register: whole ones from memory, the last ones padded with 0.
 template <class S>
 struct Reader {
@@ -38,6 +35,7 @@ struct View {
     Workspace<S>& work;
     Camera<S> K;
     S huber;
+    bool check = false;  // look for measurements that are not finite
     const S* disps;  // the state that is projected; the problem's own unless an energy is asked for
 
     View(const Problem& p_, Workspace<S>& work_, const void* disps_)
@@ -54,37 +52,33 @@ struct View {
 };
 
 // Rows of one edge over a block of cells: sums to `lanes`, E to its buffer, C and w added up.
-template <class S, bool CHECK, bool POSE, bool DEPTH>
+template <class S, bool POSE, bool DEPTH>
 void edge_block(const View<S>& view, int64_t e, const Motion<S>& G, const S* d, int64_t first,
                 int64_t n, Pack<S>* lanes, S* E, S* C, S* w, Pack<S>& energy, Pack<S>& dropped) {
     using R = Pack<S>;
     const S *target = view.target(e) + 2 * first, *weight = view.weight(e) + 2 * first;
     const S *ray_x = view.work.ray_x.data() + first, *ray_y = view.work.ray_y.data() + first;
-    for (int64_t begin = 0; begin < n; begin += GROUP * R::lanes) {
-        Linear<R> l[GROUP];
-        for (int g = 0; g < GROUP; ++g) {
-            const int64_t at = begin + g * R::lanes;
-            R tu, tv, wu, wv;
-            Reader<S>::pair(target + 2 * at, n - at, tu, tv);
-            Reader<S>::pair(weight + 2 * at, n - at, wu, wv);
-            if (CHECK) dropped += drop_nonfinite(tu, tv, wu, wv);
-            const R here = R::load(d + at);
-            const Seen<R> p = project(G, R::load(ray_x + at), R::load(ray_y + at), here);
-            const Measured<R> m = measure(view.K, p, p.ok, tu, tv, wu, wv, view.huber);
-            energy += m.energy;
-            if (!POSE && !DEPTH) continue;
-            l[g] = linearise(view.K, G, p, m, here);
-            if (DEPTH) {
-                (R::load(C + at) + depth_curvature(l[g])).store(C + at);
-                (R::load(w + at) + depth_gradient(l[g])).store(w + at);
-            }
-            if (POSE && DEPTH) {
-                R row[6];
-                coupling(l[g], row);
-                for (int k = 0; k < 6; ++k) row[k].store(E + k * BLOCK + at);
-            }
+    for (int64_t at = 0; at < n; at += R::lanes) {
+        R tu, tv, wu, wv;
+        Reader<S>::pair(target + 2 * at, n - at, tu, tv);
+        Reader<S>::pair(weight + 2 * at, n - at, wu, wv);
+        if (view.check) dropped += drop_nonfinite(tu, tv, wu, wv);
+        const R here = R::load(d + at);
+        const Seen<R> p = project(G, R::load(ray_x + at), R::load(ray_y + at), here);
+        const Measured<R> m = measure(view.K, p, p.ok, tu, tv, wu, wv, view.huber);
+        energy += m.energy;
+        if (!POSE && !DEPTH) continue;
+        const Linear<R> l = linearise(view.K, G, p, m, here);
+        if (DEPTH) {
+            (R::load(C + at) + depth_curvature(l)).store(C + at);
+            (R::load(w + at) + depth_gradient(l)).store(w + at);
         }
-        if (POSE) add_pose_sums<GROUP>(l, lanes);
+        if (POSE && DEPTH) {
+            R row[6];
+            coupling(l, row);
+            for (int k = 0; k < 6; ++k) row[k].store(E + k * BLOCK + at);
+        }
+        if (POSE) add_pose_sums(l, lanes);
     }
 }
 
@@ -112,7 +106,7 @@ void pair_rows(const S* Ea, const S* Eb, const S* Q, int64_t n, Pack<S>* lanes) 
 }
 
 // The sums of a unit: poses of every active edge, E Q rhs, and E Q E^T of every pair of edges.
-template <class S, bool CHECK, bool DEPTH>
+template <class S, bool DEPTH>
 void linearise_unit(const View<S>& view, const Unit& unit, Scratch<S>& mine, Found& found) {
     using R = Pack<S>;
     Workspace<S>& work = view.work;
@@ -130,21 +124,20 @@ void linearise_unit(const View<S>& view, const Unit& unit, Scratch<S>& mine, Fou
     S d[BLOCK], C[BLOCK], w[BLOCK], Q[BLOCK], Qr[BLOCK];
     for (int64_t first = unit.begin; first < unit.end; first += BLOCK) {
         const int64_t n = std::min<int64_t>(BLOCK, unit.end - first);
-        for (int64_t at = 0; at < n; at += GROUP * R::lanes)
-            for (int64_t g = at; g < at + GROUP * R::lanes; g += R::lanes) {
-                Reader<S>::one(view.disps + frame + first + g, n - g).store(d + g);
-                R(S(0)).store(C + g);
-                R(S(0)).store(w + g);
-            }
+        for (int64_t at = 0; at < n; at += R::lanes) {
+            Reader<S>::one(view.disps + frame + first + at, n - at).store(d + at);
+            R(S(0)).store(C + at);
+            R(S(0)).store(w + at);
+        }
         for (int64_t e = source.first; e < source.last; ++e) {
             const Motion<S> G = rounded<S>(work.motions[e]);
             const int64_t a = e - source.first;
             if (e < source.active)
-                edge_block<S, CHECK, true, DEPTH>(
+                edge_block<S, true, DEPTH>(
                     view, e, G, d, first, n, lanes + a * POSE_SUMS, mine.E.data() + a * 6 * BLOCK,
                     C, w, energy, dropped);
             else
-                edge_block<S, CHECK, false, DEPTH>(
+                edge_block<S, false, DEPTH>(
                     view, e, G, d, first, n, nullptr, nullptr, C, w, energy, dropped);
         }
         if (!DEPTH) continue;
@@ -195,7 +188,7 @@ void linearise_unit(const View<S>& view, const Unit& unit, Scratch<S>& mine, Fou
 
 // Disparity steps Q (rhs - E^T y) of a unit, with E computed once more: that is less work than to
 // store and load it. `steps` [edges,6] is what every edge sees of the pose steps.
-template <class S, bool CHECK>
+template <class S>
 void substitute_unit(const View<S>& view, const Unit& unit, const double* steps) {
     using R = Pack<S>;
     Workspace<S>& work = view.work;
@@ -223,7 +216,7 @@ void substitute_unit(const View<S>& view, const Unit& unit, const double* steps)
                 R tu, tv, wu, wv;
                 Reader<S>::pair(target + 2 * at, n - at, tu, tv);
                 Reader<S>::pair(weight + 2 * at, n - at, wu, wv);
-                if (CHECK) drop_nonfinite(tu, tv, wu, wv);
+                if (view.check) drop_nonfinite(tu, tv, wu, wv);
                 const R here = R::load(d + at);
                 const Seen<R> p = project(
                     G, R::load(work.ray_x.data() + first + at),
@@ -240,7 +233,7 @@ void substitute_unit(const View<S>& view, const Unit& unit, const double* steps)
 }
 
 // Energy of another state over the cells that passed the near test at the start of the step.
-template <class S, bool CHECK>
+template <class S>
 double energy_unit(const View<S>& start, const View<S>& now, const Motion<double>* moved,
                    const Unit& unit) {
     using R = Pack<S>;
@@ -256,7 +249,7 @@ double energy_unit(const View<S>& start, const View<S>& now, const Motion<double
             R tu, tv, wu, wv;
             Reader<S>::pair(target + 2 * at, left, tu, tv);
             Reader<S>::pair(weight + 2 * at, left, wu, wv);
-            if (CHECK) drop_nonfinite(tu, tv, wu, wv);
+            if (start.check) drop_nonfinite(tu, tv, wu, wv);
             const R x = R::load(work.ray_x.data() + at), y = R::load(work.ray_y.data() + at);
             const R before = depth_ratio(G0, x, y, Reader<S>::one(start.disps + frame + at, left));
             const R ok = select(before >= R(S(NEAR_DEPTH)), R(S(1)), R(S(0)));
