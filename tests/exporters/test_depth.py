@@ -156,3 +156,23 @@ def test_two_exports_give_the_same_bytes(result, tmp_path):
         depth.DepthExporter().export(result, folder)
     for path in (first / "depth").iterdir():
         assert path.read_bytes() == (second / "depth" / path.name).read_bytes()
+
+
+def test_pictures_at_full_size(result, tmp_path):
+    first, *others = result.keyframes
+    cells = first.disp.shape
+    fine = np.random.default_rng(0).uniform(0.2, 0.4, (8 * cells[0], 8 * cells[1]))
+    first = replace(first, disp_full=fine.astype(np.float32))
+    result = replace(result, keyframes=(first, *others), stride=8, offset=0.0)
+    exporter = depth.COMPONENT.factory(depth.DepthOptions(full=True), None)
+    written = exporter.export(result, tmp_path)
+    folder = tmp_path / "depth"
+    assert [p for p in written if p.parent.name == "full"] == [folder / "full" / "000000.png"]
+    scale = json.loads((folder / "scale.json").read_text())["scale"]
+    values = picture(folder / "full", first)
+    assert values.shape == fine.shape
+    kept = (np.isfinite(first.disp) & (first.disp > 0) & first.depth_valid).repeat(8, 0)
+    kept = kept.repeat(8, 1)
+    assert kept.any() and not kept.all()
+    assert (values[~kept] == 0).all()
+    assert np.allclose(values[kept] * scale, 1 / fine[kept], atol=0.51 * scale)

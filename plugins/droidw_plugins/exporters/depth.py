@@ -33,6 +33,13 @@ class DepthOptions:
         default=True, metadata={"help": "write the pictures, depth/NNNNNN.png and scale.json"}
     )
     npz: bool = field(default=True, metadata={"help": "write depth/depth.npz"})
+    full: bool = field(
+        default=False,
+        metadata={
+            "help": "also write pictures at the full size, depth/full/NNNNNN.png, where "
+            "correspondence enlarges depth itself (droid)"
+        },
+    )
     scale: float = field(
         default=0.0,
         metadata={
@@ -74,7 +81,8 @@ class DepthExporter:
 
     `NNNNNN.png`, named by the index of the frame, holds the depth of one keyframe on the grid of
     the run, one 16-bit value per cell: depth = value * scale, in scene units, 0 where unknown or
-    not confirmed by other keyframes. The scale is in `scale.json`.
+    not confirmed by other keyframes. The scale is in `scale.json`. `full/NNNNNN.png`, if asked for,
+    is the same at the size of the working picture.
 
     `depth.npz` holds what was estimated, K keyframes on a grid of h x w cells: `depth` [K,h,w]
     float32 in scene units (0 where there is none), `valid` [K,h,w] bool (confirmed by other
@@ -84,14 +92,19 @@ class DepthExporter:
 
     Args:
         all: also put unconfirmed depth into the pictures.
-        png, npz: what to write.
+        png, npz, full: what to write; `full` needs `png`.
         scale: scene units per step of a picture's value, 0 to choose one.
     """
 
     def __init__(
-        self, all: bool = False, png: bool = True, npz: bool = True, scale: float = 0.0
+        self,
+        all: bool = False,
+        png: bool = True,
+        npz: bool = True,
+        scale: float = 0.0,
+        full: bool = False,
     ) -> None:
-        self._all, self._png, self._npz, self._scale = all, png, npz, scale
+        self._all, self._png, self._npz, self._scale, self._full = all, png, npz, scale, full
 
     def export(self, result: RunResult, folder: Path) -> list[Path]:
         """Write pictures and numbers.
@@ -148,7 +161,31 @@ class DepthExporter:
         }
         path = folder / "scale.json"
         write_scale(path, facts)
+        if self._full:
+            written += _enlarged(result, keep, scale, folder / "full")
         return [*written, path]
+
+
+def _enlarged(
+    result: RunResult, keep: npt.NDArray[np.bool_], scale: float, folder: Path
+) -> list[Path]:
+    """Pictures at the full size of all keyframes that have such a map."""
+    from droidw_plugins.exporters._maps import make_folder, write_map
+
+    written = []
+    for keyframe, kept in zip(result.keyframes, keep, strict=True):
+        disp = keyframe.disp_full
+        if disp is None:
+            continue
+        make_folder(folder)
+        # The fine values of a cell begin at its pixel and go on to the next.
+        rows, columns = (np.arange(side) // result.stride for side in disp.shape)
+        fine = kept[rows[:, None], columns] & np.isfinite(disp) & (disp > 0)
+        depth = np.divide(1.0, disp, out=np.zeros_like(disp), where=fine)
+        path = folder / f"{keyframe.index:06d}.png"
+        write_map(path, encode(depth, fine, scale))
+        written.append(path)
+    return written
 
 
 def _write_numbers(
@@ -180,7 +217,7 @@ def _write_numbers(
 
 
 def _make(options: DepthOptions, context: BuildContext) -> Exporter:
-    return DepthExporter(options.all, options.png, options.npz, options.scale)
+    return DepthExporter(options.all, options.png, options.npz, options.scale, options.full)
 
 
 COMPONENT: Component[Exporter] = Component(
