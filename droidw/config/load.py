@@ -97,18 +97,31 @@ def load_config(
             before the options in the same list, in whatever order they were typed.
         values: full key -> value, as flags such as `--stride` give them.
         layers: where from -> tree as in a file; merged last, in this order.
+    A source such as `bonn:balloon` brings the settings of its dataset along, just above the
+    preset, where `configs/datasets` names that preset.
+
     Raises:
         ConfigError: a file is missing, is no YAML, extends itself, or a slot holds no name.
         UsageError: an override is not `key=value`, or there is no such preset.
     """
-    merger = _Merger()
-    if preset is not None:
-        merger.add_file(_preset_path(preset), ())
-    for file in files:
-        merger.add_file(Path(file), ())
     said = [_nested(key.split("."), value) for key, value in (values or {}).items()]
-    for where, layer in (*override_layers(overrides, said), *layers):
-        merger.merge(merger.data, layer, "", {"": Source(where)})
+    last = [*override_layers(overrides, said), *layers]
+
+    def merged(source: str) -> _Merger:
+        merger = _Merger()
+        if preset is not None:
+            merger.add_file(_preset_path(preset), ())
+        merger.add_dataset(source, preset)
+        for file in files:
+            merger.add_file(Path(file), ())
+        for where, layer in last:
+            merger.merge(merger.data, layer, "", {"": Source(where)})
+        return merger
+
+    merger = merged("")
+    source = merger.data["input"].get("source")
+    if preset is not None and isinstance(source, str) and ":" in source:
+        merger = merged(source)
     return LoadedConfig(merger.data, merger.sources, tuple(merger.files), preset)
 
 
@@ -167,8 +180,28 @@ class _Merger:
             )
         for name in names:
             self.add_file(_extended(name, path, lines["extends"]), (*stack, real))
+        if _is_table(tree.get("dataset")):  # for readers and `droidw data`, no setting of a run
+            del tree["dataset"]
         self.files.append(_shown(path))
         self.merge(self.data, tree, "", {"": Source(_shown(path)), **lines})
+
+    def add_dataset(self, source: str, preset: str | None) -> None:
+        """Merge the settings of the dataset, and of the sequence, that a source names."""
+        dataset, _, name = source.partition(":")
+        path = packaged_configs().get(f"datasets/{dataset}") if name else None
+        if path is None:
+            return
+        tree, lines = read_yaml(path)
+        table = tree.pop("dataset", None)
+        if not _is_table(table) or preset not in table.get("presets", []):
+            return
+        shown = _shown(path)
+        self.files.append(shown)
+        self.merge(self.data, tree, "", {"": Source(shown), **lines})
+        for key, row in table["sequences"].items():
+            if row and name in (key, *row.get("also", ())):
+                at = lines.get(f"dataset.sequences.{key}", Source(shown))
+                self.merge(self.data, row.get("run", {}), "", {"": at})
 
     def merge(
         self, base: _Tree, layer: Mapping[str, Any], prefix: str, lines: Mapping[str, Source]
@@ -227,6 +260,11 @@ class _Merger:
     def _forget(self, full: str) -> None:
         for key in [k for k in self.sources if k == full or k.startswith(full + ".")]:
             del self.sources[key]
+
+
+def _is_table(tree: Any) -> bool:
+    """Whether this is the table of a dataset (`droidw.io.dataset_tables`)."""
+    return isinstance(tree, Mapping) and isinstance(tree.get("sequences"), Mapping)
 
 
 def _chooses(layer: Mapping[str, Any]) -> bool:

@@ -28,7 +28,6 @@ from droidw.eval.masks import score_folder
 from droidw.eval.metrics import score
 from droidw.events import Dispatcher, Progress, RunFailed, RunFinished, RunStarted
 from droidw.geometry.camera import Rectifier
-from droidw.interfaces.datasets import Selection
 from droidw.io.prefetch import prefetch
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
@@ -36,13 +35,14 @@ from droidw.run.cameras import choose_camera, open_masks
 from droidw.run.folder import FILES, prepare, withdraw, write_json, write_text
 from droidw.run.manifest import REPORTS, facts_of_setup, facts_of_time, facts_of_tracking
 from droidw.run.signals import Stop
+from droidw.run.sources import open_source
 from droidw.slam.frame import RunResult
 from droidw.slam.optimise import Parts
 from droidw.slam.system import Outcome, SlamSystem
 
 if TYPE_CHECKING:
     from droidw.config.resolve import ResolvedConfig
-    from droidw.interfaces.datasets import DatasetReader, FrameSource
+    from droidw.interfaces.datasets import FrameSource
     from droidw.plugin.manager import Plugins
     from droidw.slam.frame import Frame, RawFrame
     from droidw.slam.timing import Stopwatch
@@ -128,7 +128,7 @@ class _Run:
             raise
 
     def _go(self) -> RunResult:
-        source = self._open()
+        source = open_source(self.resolved, self.plugins, self.context)
         pictures = iter(source.frames())
         first = next(pictures, None)
         if first is None:
@@ -225,34 +225,6 @@ class _Run:
             )
 
     # -- stages ----------------------------------------------------------------------------
-
-    def _open(self) -> FrameSource:
-        given = self.config.input
-        if not given.source:
-            raise InputError("no source is given", "type: droidw run SOURCE")
-        selection = Selection(given.stride, given.skip, given.max_frames)
-        if "reader" in self.resolved.parts:
-            component, options = self.resolved.parts["reader"]
-            chosen: DatasetReader = component.factory(options, self.context)
-            return chosen.open(given.source, selection)
-        registry = self.plugins.registry("reader")
-        for name in registry.names():
-            if registry.status(name) != "ready":
-                continue
-            component = registry.get(name)
-            reader: DatasetReader = component.factory(component.options(), self.context)
-            if reader.recognises(given.source):
-                _log.info(f"reader: {name}")
-                return reader.open(given.source, selection)
-        what = Path(given.source)
-        found = (
-            "there is no such file or folder" if not what.exists() else "no reader recognises it"
-        )
-        raise InputError(
-            f"{given.source}: {found}",
-            "a source is a folder of pictures, a video file, or reader:sequence\n"
-            f"readers: {', '.join(registry.names())}   (choose one with reader=NAME)",
-        )
 
     def _build(self) -> Parts:
         def part(slot: str) -> Any:

@@ -86,7 +86,7 @@ def test_extends_of_nothing(write):
     message = refusal([mine])
     assert message.startswith(
         "mine.yaml:2: extends: there is no file or packaged config 'presets/papr'\n"
-        "  did you mean 'presets/paper'?   packaged: base, "
+        "  did you mean 'presets/paper'?   packaged: "
     )
     write("mine.yaml", "extends: 3\n")
     assert refusal([mine]).startswith(
@@ -179,7 +179,8 @@ def test_overrides_that_are_refused():
 
 def test_unknown_preset():
     assert refusal(preset="papr", error=UsageError) == (
-        "--preset: no preset is called 'papr'\n  did you mean 'paper'?   presets: cpu, droid-slam, paper, auto"
+        "--preset: no preset is called 'papr'\n"
+        "  did you mean 'paper'?   presets: cpu, droid-slam, paper, auto"
     )
 
 

@@ -1,0 +1,69 @@
+"""Opening the source that a configuration names."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from droidw.errors import InputError
+from droidw.interfaces.datasets import Selection
+from droidw.io.dataset_tables import split_source, table_names
+from droidw.plugin.registry import nearest
+
+if TYPE_CHECKING:
+    from droidw.config.resolve import ResolvedConfig
+    from droidw.interfaces.datasets import DatasetReader, FrameSource
+    from droidw.plugin.component import BuildContext
+    from droidw.plugin.manager import Plugins
+
+__all__ = ["open_source"]
+
+_log = logging.getLogger("droidw.run.drive")
+
+
+def open_source(resolved: ResolvedConfig, plugins: Plugins, context: BuildContext) -> FrameSource:
+    """The footage of a run, by the reader that is named, or by the first that recognises it.
+
+    Raises:
+        InputError: no source is given, nothing recognises it, or it cannot be used.
+    """
+    given = resolved.config.input
+    if not given.source:
+        raise InputError("no source is given", "type: droidw run SOURCE")
+    selection = Selection(given.stride, given.skip, given.max_frames)
+    if "reader" in resolved.parts:
+        component, options = resolved.parts["reader"]
+        chosen: DatasetReader = component.factory(options, context)
+        return chosen.open(given.source, selection)
+    registry = plugins.registry("reader")
+    for name in registry.names():
+        if registry.status(name) != "ready":
+            continue
+        component = registry.get(name)
+        reader: DatasetReader = component.factory(component.options(), context)
+        if reader.recognises(given.source):
+            _log.info(f"reader: {name}")
+            return reader.open(given.source, selection)
+    raise _unknown(given.source, registry.names())
+
+
+def _unknown(source: str, readers: list[str]) -> InputError:
+    """What to say of a source that nobody recognises."""
+    choose = f"readers: {', '.join(readers)}   (choose one with reader=NAME)"
+    parted = split_source(source)
+    if parted is not None:
+        names = sorted({*table_names(), *readers})
+        near = nearest(parted[0], names)
+        return InputError(
+            f"{source}: no dataset is called '{parted[0]}'",
+            (f"did you mean '{near}:{parted[1]}'?   " if near else "")
+            + f"datasets: {', '.join(table_names())}   (sequences: droidw data list)\n{choose}",
+        )
+    found = (
+        "no reader recognises it" if Path(source).exists() else "there is no such file or folder"
+    )
+    return InputError(
+        f"{source}: {found}",
+        f"a source is a folder of pictures, a video file, or reader:sequence\n{choose}",
+    )
