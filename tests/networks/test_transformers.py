@@ -10,6 +10,7 @@ from droidw.errors import ConfigError, InputError, MissingRequirementError
 from droidw.geometry.camera import Grid
 from droidw.plugin.component import BuildContext
 from droidw.testing.conformance import check_feature_extractor
+from droidw_plugins._vit.layers import choose_dtype, exact
 from droidw_plugins._vit.model import VitSpec, resample_positions
 from droidw_plugins._vit.published import FORMS, load_transformer, transformer_shapes
 from droidw_plugins._weights import DINOV2_VITS14, DINOV2_VITS14_REG, FIT3D, FIT3D_PLAIN
@@ -160,13 +161,17 @@ def test_sampling_is_enlarging_and_picking_pixels(size):
     generator = torch.Generator().manual_seed(3)
     patches = torch.randn(5, rows, columns, generator=generator, dtype=torch.float64)
     large = F.interpolate(patches[None], size=size, mode="bilinear", align_corners=False)[0]
+    for stride, pixel in ((8, 3), (8, 0), (4, 2)):  # pixel 3 of 8 is what the published code reads
+        grid = Grid.of(height, width, stride, float(pixel))
+        expected = large[:, pixel::stride, pixel::stride][:, : grid.height, : grid.width]
+        assert gap(sample_at_cells(patches, size, grid), expected) < 1e-12
+    # Between two pixels a cell lies between them, and not at one of them.
     grid = Grid.of(height, width, 8, 3.5)
-    expected = large[:, 3::8, 3::8][:, : grid.height, : grid.width]
-    assert gap(sample_at_cells(patches, size, grid), expected) < 1e-12
-    assert gap(sample_at_cells(patches, size, grid), grid.sample(large, mode="nearest")) < 1e-12
-    grid = Grid.of(height, width, 4, 2.0)
-    expected = large[:, 2::4, 2::4][:, : grid.height, : grid.width]
-    assert gap(sample_at_cells(patches, size, grid), expected) < 1e-12
+    centres = (grid.centres().double() + 0.5) / torch.tensor([width, height]) * 2 - 1
+    expected = F.grid_sample(
+        patches[None], centres[None], padding_mode="border", align_corners=False
+    )[0]
+    assert gap(sample_at_cells(patches, size, grid), expected) < 1e-6
 
 
 def test_patch_grids():
@@ -192,10 +197,10 @@ def test_features_are_handed_over_in_half(extractor):
 def test_bfloat16_products_and_larger_inputs(extractor):
     image = torch.rand(3, 48, 64, generator=torch.Generator().manual_seed(5))
     grid = Grid.of(48, 64, 8, 3.5)
-    exact = extractor("dinov2-vits14", dtype="float32").extract(image, grid)
+    sharp = extractor("dinov2-vits14", dtype="float32").extract(image, grid)
     rough = extractor("dinov2-vits14", dtype="float32", precision="bfloat16").extract(image, grid)
-    assert 0 < gap(rough, exact) < 0.2
-    assert F.cosine_similarity(rough, exact, dim=0).min() > 0.999
+    assert 0 < gap(rough, sharp) < 0.2
+    assert F.cosine_similarity(rough, sharp, dim=0).min() > 0.999
     fine = extractor("dinov2-vits14", long_side=112)
     assert fine.patches(image).shape == (384, 6, 8)
 
@@ -272,6 +277,20 @@ def test_what_differs_is_counted(stand_in):
     assert "and 1 more" in caught.value.message
     assert "1 holds no floats ('norm.weight' (torch.int64))" in caught.value.message
     assert "droidw weights fetch fit3d" in caught.value.hint
+
+
+def test_float32_on_a_gpu_is_float32_and_nothing_stays_changed():
+    cudnn = torch.backends.cudnn
+    before = cudnn.enabled, cudnn.benchmark, cudnn.deterministic, cudnn.allow_tf32
+    with exact(torch.float32, torch.device("cuda")):
+        assert not cudnn.allow_tf32
+        assert (cudnn.enabled, cudnn.benchmark, cudnn.deterministic) == before[:3]
+    for dtype, device in ((torch.float16, "cuda"), (torch.float32, "cpu")):
+        with exact(dtype, torch.device(device)):
+            assert cudnn.allow_tf32 == before[3]
+    assert (cudnn.enabled, cudnn.benchmark, cudnn.deterministic, cudnn.allow_tf32) == before
+    assert choose_dtype("auto", torch.device("cuda"), "key") == torch.float16
+    assert choose_dtype("auto", CPU, "key") == torch.float32
 
 
 def test_prefix_counts_class_and_registers():

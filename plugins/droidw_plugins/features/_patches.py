@@ -156,20 +156,18 @@ def patch_grid(height: int, width: int, long_side: int = 0) -> tuple[int, int]:
 def sample_at_cells(patches: Tensor, size: tuple[int, ...], grid: Grid) -> Tensor:
     """The map [C,gh,gw] of patches at the cells, [C,h,w].
 
-    The same as enlarging the map to the picture bilinearly (corners not aligned) and taking the
-    pixels of the cells, without the large map: REFERENCE 4.1. A cell that lies between two pixels
-    takes the upper left one (3, 11, 19, ... for offset 3.5), as the published code and
-    `Grid.sample(mode="nearest")` do for the depth prior.
+    The same as enlarging the map to the picture bilinearly (corners not aligned) and reading it
+    at the cells, without the large map. The published code reads pixels 3, 11, 19, ...: a grid of
+    stride 8 and offset 3 gives exactly that (REFERENCE 4.1).
 
     Args:
         patches: of the whole picture.
         size: (H,W) of the picture.
         grid: where to sample.
     """
-    start = math.ceil(grid.offset - 0.5)
 
     def axis(count: int, cells: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
-        pixel = torch.arange(cells, dtype=torch.float64) * grid.stride + start
+        pixel = torch.arange(cells, dtype=torch.float64) * grid.stride + grid.offset
         where = ((pixel + 0.5) * count / side - 0.5).clamp(0, count - 1)
         low = where.floor().long().clamp_max(max(count - 2, 0))
         high = (low + 1).clamp_max(count - 1)
