@@ -25,6 +25,7 @@ VERBS: Mapping[str, str] = {
     "list-plugins": "droidw.cli.list_plugins",
     "demo": "droidw.cli.demo",
     "weights": "droidw.cli.weights",
+    "data": "droidw.cli.data",
     "doctor": "droidw.cli.doctor",
 }
 """Verb -> the module that holds it, in the order of the help text."""
