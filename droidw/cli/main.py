@@ -22,6 +22,7 @@ __all__ = ["VERBS", "build_parser", "main"]
 VERBS: Mapping[str, str] = {
     "run": "droidw.cli.run",
     "eval": "droidw.cli.evaluate",
+    "ablate": "droidw.cli.ablate",
     "list-plugins": "droidw.cli.list_plugins",
     "demo": "droidw.cli.demo",
     "weights": "droidw.cli.weights",

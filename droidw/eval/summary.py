@@ -74,8 +74,8 @@ def evaluate(
 
     Args:
         path: run folder with `trajectory.tum`, or a TUM file.
-        reference: TUM file, folder that holds `groundtruth.txt`, or None to look in the source
-            that the run folder names.
+        reference: TUM file, folder that holds `groundtruth.txt`, or None for the `truth.tum` of
+            the run folder, or the source that the run folder names.
         align, max_diff, offset, delta, normalise, unit: as for `score`.
         masks: folder of masks, or None to look for `mask/` in the source of the run.
         masks_after: leave so many keyframes at the start out of the score of the masks.
@@ -92,7 +92,7 @@ def evaluate(
         )
     source = source_of(run_dir) if run_dir else None
     if reference is None:
-        reference = _reference_of_source(source)
+        reference = _reference(run_dir, source)
     ref_file = reference_file(reference)
     truth = _File.read(ref_file)
     options: dict[str, Any] = {
@@ -151,12 +151,14 @@ def _score_file(est: _File, ref: _File, options: dict[str, Any]) -> TrajectorySc
     )
 
 
-def _reference_of_source(source: Path | None) -> Path:
+def _reference(run_dir: Path | None, source: Path | None) -> Path:
+    if run_dir is not None and (run_dir / "truth.tum").is_file():
+        return run_dir / "truth.tum"
     if source is not None and (source / "groundtruth.txt").is_file():
         return source
     raise UsageError(
-        "nothing to compare with: no reference was given, and the run does not name a source "
-        "with a groundtruth.txt",
+        "nothing to compare with: no reference was given, and the run has no truth.tum and does "
+        "not name a source with a groundtruth.txt",
         "give one: --ref FILE (TUM: t tx ty tz qx qy qz qw) or --ref FOLDER (with groundtruth.txt)",
     )
 

@@ -29,6 +29,7 @@ from droidw.eval.metrics import score
 from droidw.events import Dispatcher, Progress, RunFailed, RunFinished, RunStarted
 from droidw.geometry.camera import Rectifier
 from droidw.io.prefetch import prefetch
+from droidw.io.tum import write_tum
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
 from droidw.run.cameras import choose_camera, open_masks
@@ -261,6 +262,8 @@ class _Run:
             for text in source.problems[:5]:
                 warnings.warn(text)
         truth = source.truth
+        if truth is not None:
+            write_tum(self.run_dir / "truth.tum", truth)
         metrics = self._score(outcome, truth)
         result = RunResult(
             trajectory=outcome.trajectory,

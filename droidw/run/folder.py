@@ -16,6 +16,7 @@ __all__ = ["FILES", "prepare", "withdraw", "write_json", "write_text"]
 FILES: Mapping[str, str] = {
     "trajectory.tum": "pose of every input frame: t tx ty tz qx qy qz qw, camera to world",
     "keyframes.tum": "the same for keyframes only",
+    "truth.tum": "the ground truth as the source gives it",
     "points.ply": "static point cloud, coloured",
     "report.html": "this run on one page",
     "metrics.json": "errors against the ground truth",

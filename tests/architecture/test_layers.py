@@ -21,6 +21,7 @@ ALLOWED = {
     "slam": EVERYONE | {"geometry", "graph", "solve", "io", "config"},
     "testing": EVERYONE | {"geometry", "graph", "solve", "io", "slam"},
     "eval": EVERYONE | {"geometry", "graph", "solve", "io", "slam", "config", "run"},
+    "ablation": EVERYONE | {"geometry", "io", "slam", "config", "eval", "run"},
     "run": EVERYONE
     | {"geometry", "graph", "solve", "io", "slam", "config", "eval", "testing", "checkpoint"},
     "checkpoint": EVERYONE | {"geometry", "graph", "solve", "io", "slam", "config"},

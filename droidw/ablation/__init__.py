@@ -1,0 +1,1 @@
+"""Ablations: rows of a table as configurations, run cell by cell, and made into a table."""

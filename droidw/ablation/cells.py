@@ -1,0 +1,254 @@
+"""The cells of an ablation: one configuration each, a folder each, and what came of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import yaml
+
+from droidw.ablation.plan import Layer, Measuring, Plan
+from droidw.config.load import load_config, override_layers
+from droidw.config.resolve import ResolvedConfig, choose_preset, resolve
+from droidw.errors import DroidwError, InputError, MissingRequirementError, PluginError
+from droidw.io.files import atomic_write
+
+if TYPE_CHECKING:
+    from droidw.plugin.manager import Plugins
+
+__all__ = ["Cell", "Outcome", "make_cells", "prepare", "read_outcome", "write_json"]
+
+_QUICK: Layer = (
+    "ablation",
+    {
+        # One thread: cells run side by side, and the same numbers come out whatever their number.
+        "threads": 1,
+        "exporters": {
+            "ply": None, "depth": None, "uncertainty": {"video": False, "masks": False},
+        },
+        "observers": {"progress": None, "report": None},
+    },
+)  # fmt: skip
+"""What a cell does unless the file says otherwise: it writes what is measured, and no more."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One row on one sequence with one seed.
+
+    Attributes:
+        row, sequence, seed: its place in the table.
+        config: the resolved configuration as YAML.
+        missing: why it cannot run on this machine, or "".
+        threads: of torch and of workers. gpus: how many it wants.
+    """
+
+    row: str
+    sequence: str
+    seed: int
+    config: str
+    missing: str = ""
+    threads: int = 1
+    gpus: float = 0
+
+    @property
+    def name(self) -> str:
+        """Its folder below `cells/`."""
+        return f"{self.row}/{self.sequence}/seed-{self.seed}"
+
+    @property
+    def digest(self) -> str:
+        """What its result depends on: the configuration without comments, as a hash."""
+        lines = [line for line in self.config.splitlines() if not line.startswith("#")]
+        return hashlib.sha256("\n".join(lines).encode("utf-8")).hexdigest()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a cell.
+
+    Attributes:
+        metrics: figures by dotted name, those that exist.
+        facts: device, versions and so on.
+        curve: path and errors for plots, or empty.
+        error: why there are no figures, or "".
+        code: exit code of a cell that failed.
+        seconds: how long its process took.
+    """
+
+    metrics: Mapping[str, float]
+    facts: Mapping[str, Any]
+    curve: Mapping[str, Any]
+    error: str = ""
+    code: int = 0
+    seconds: float = 0.0
+
+
+def make_cells(
+    plan: Plan, plugins: Plugins, overrides: Sequence[str] = (), preset: str | None = None
+) -> tuple[list[Cell], str]:
+    """Resolve every cell, so that a mistake in the last row shows before the first one runs.
+
+    From weak to strong: preset, `config` files, `base`, the sequence, overrides, the row, the seed
+    and what varies with it.
+
+    Returns:
+        Cells, row by row, and why a preset was chosen (or "").
+    Raises:
+        ConfigError, UsageError: a row, sequence or override is refused.
+        PluginNotFound: a row names a plugin that is not there.
+        InputError: a sequence is not there.
+        MissingRequirementError: no cell at all can run on this machine.
+    """
+    chosen, note = preset or plan.preset, ""
+    if chosen == "auto":
+        chosen, note = choose_preset(plugins)
+    _check_sources(plan)
+    said = override_layers(overrides)
+    problems: list[DroidwError] = []
+    known: dict[str, Cell] = {}
+    cells: list[Cell] = []
+    for row, row_layer in plan.rows.items():
+        for sequence, footage in plan.sequences.items():
+            # Resolving takes a while, and sequences and seeds often differ in values alone.
+            same = json.dumps([row, footage.layer[1], footage.vary], default=str)
+            if same not in known:
+                source = {"seed": plan.seeds[0], "input": {"source": _place(footage.source)}}
+                varied = override_layers([f"{key}={plan.seeds[0]}" for key in footage.vary])
+                layers = (_QUICK, plan.base, footage.layer, *said, row_layer)
+                loaded = load_config(
+                    plan.config, chosen, (), None, (*layers, ("ablation", source), *varied)
+                )
+                try:
+                    known[same] = _cell(row, sequence, resolve(loaded, plugins), plan)
+                except (MissingRequirementError, PluginError) as error:
+                    problems.append(error)
+                    text = yaml.safe_dump(loaded.data, sort_keys=False)
+                    known[same] = Cell(row, sequence, 0, text, missing=error.message)
+            for seed in plan.seeds:
+                values = {"seed": seed, "input.source": _place(footage.source)}
+                values |= dict.fromkeys(footage.vary, seed)
+                config = _with(known[same].config, values)
+                cells.append(replace(known[same], sequence=sequence, seed=seed, config=config))
+    if problems and len(problems) == len(known):
+        raise problems[0]
+    return cells, note
+
+
+def _place(source: str) -> str:
+    return source if ":" in source else str(Path(source).resolve())
+
+
+def _with(text: str, values: Mapping[str, Any]) -> str:
+    """A resolved configuration with other values of these full keys."""
+    tree = yaml.safe_load(text)
+    for key, value in values.items():
+        *path, last = key.split(".")
+        part = tree
+        for name in path:
+            part = part[name]
+        part[last] = value
+    head = [line for line in text.splitlines() if line.startswith("#")]
+    return "\n".join([*head, str(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))])
+
+
+def _cell(row: str, sequence: str, resolved: ResolvedConfig, plan: Plan) -> Cell:
+    gpus = plan.needs.get("gpus")
+    if gpus is None:
+        gpus = float(_wants_gpu(resolved))
+    threads = max(1, resolved.config.threads)
+    return Cell(row, sequence, 0, resolved.to_yaml(), threads=threads, gpus=gpus)
+
+
+def _wants_gpu(resolved: ResolvedConfig) -> bool:
+    device = resolved.config.device
+    if device != "auto":
+        return device.startswith("cuda")
+    if "cuda" not in resolved.devices:
+        return False
+    import torch
+
+    return torch.cuda.is_available()
+
+
+def _check_sources(plan: Plan) -> None:
+    gone = [
+        f"{name} ({footage.source})"
+        for name, footage in plan.sequences.items()
+        if ":" not in footage.source and not Path(footage.source).exists()
+    ]
+    if gone:
+        raise InputError(
+            f"{plan.file}: of {len(plan.sequences)} sequences, {len(gone)} are not there: "
+            + ", ".join(gone),
+            "say where they are: --data DIR; or choose others: --sequences NAME,NAME",
+        )
+
+
+def prepare(
+    cell: Cell,
+    folder: Path,
+    measure: Measuring,
+    plugin_files: Sequence[str] = (),
+    data: Path | None = None,
+) -> None:
+    """Write what the process of a cell reads: `cell.yaml` and `cell.json`.
+
+    Args:
+        cell: what is run. folder: of the cell. measure: how it is measured.
+        plugin_files: as given with --plugin. data: folder of datasets, or None for the usual one.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for stale in ("failure.json", "result.json"):
+        (folder / stale).unlink(missing_ok=True)
+    with atomic_write(folder / "cell.yaml") as stream:
+        stream.write(cell.config.encode("utf-8"))
+    spec = {
+        "row": cell.row,
+        "sequence": cell.sequence,
+        "seed": cell.seed,
+        "digest": cell.digest,
+        "threads": cell.threads,
+        "plugins": [str(Path(file).resolve()) for file in plugin_files],
+        "data": None if data is None else str(data.expanduser().resolve()),
+        "folder": str(Path.cwd()),
+        "measure": asdict(measure),
+    }
+    write_json(folder / "cell.json", spec)
+
+
+def read_outcome(cell: Cell, folder: Path, measure: Measuring) -> Outcome | None:
+    """What came of a cell earlier, or None if it has to run (again).
+
+    A finished cell whose configuration is another now has to; one that is only to be measured
+    differently is measured again from its files.
+    """
+    record = _read(folder / "result.json")
+    if record is not None and record.get("digest") == cell.digest:
+        if record.get("measure") != asdict(measure):
+            from droidw.ablation.measure import measure_run
+
+            record.update(measure_run(folder / "run", measure), measure=asdict(measure))
+            write_json(folder / "result.json", record)
+        return Outcome(
+            record["metrics"], record["facts"], record["curve"], seconds=record.get("seconds", 0.0)
+        )
+    return None
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON as a whole or not at all."""
+    with atomic_write(path) as stream:
+        stream.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode("utf-8"))
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return record if isinstance(record, dict) else None

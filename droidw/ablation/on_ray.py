@@ -1,0 +1,121 @@
+"""Cells as Ray tasks, on this machine or a cluster (extra `ray`)."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from droidw.ablation.cells import Cell
+from droidw.ablation.local import Tell, attend, conclude
+from droidw.errors import DroidwError, MissingRequirementError
+
+__all__ = ["RETRIES", "require_ray", "run_on_ray"]
+
+RETRIES = 3
+"""How often a cell is started again whose worker was lost."""
+
+_POLL = 0.5
+
+
+def require_ray() -> None:
+    """Raise a sentence where Ray is not installed.
+
+    Raises:
+        MissingRequirementError: it is not.
+    """
+    if importlib.util.find_spec("ray") is None:
+        raise MissingRequirementError(
+            "--executor ray: the package 'ray' is not installed",
+            "pip install 'droidw[ray]', or run the cells as processes: --executor local",
+        )
+
+
+def run_on_ray(
+    cells: Sequence[tuple[Cell, Path]],
+    tell: Tell,
+    jobs: int,
+    limit: float | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+    address: str | None = None,
+    cpus: float | None = None,
+) -> None:
+    """Run cells that have been prepared as tasks of Ray, and tell of each.
+
+    The folders must be the same place on all machines of a cluster. A task takes as many CPUs as
+    its cell has threads, and the GPUs that the cell wants. Where a worker is lost, Ray starts the
+    cell again on another, up to `RETRIES` times; a cell that fails by itself is not tried again.
+
+    Args:
+        cells, tell, limit, stopped: as for `run_local`.
+        jobs: cells at a time on a local Ray; a cluster decides for itself.
+        address: of a running cluster ("auto": the one of this machine), or None for a Ray that
+            lives as long as this call.
+        cpus: of each task, instead of its threads.
+    Raises:
+        MissingRequirementError: Ray is not installed.
+        DroidwError: Ray cannot be started or reached.
+    """
+    require_ray()
+    # Ray reports on its use over the network unless told otherwise before it is imported.
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    import ray
+
+    each = [cpus if cpus is not None else float(cell.threads) for cell, _ in cells]
+    place = None if address else tempfile.mkdtemp(prefix="droidw-ray-")
+    try:
+        try:
+            if address:
+                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+            else:
+                room = max(1, round(jobs * max(each, default=1.0)))
+                ray.init(
+                    num_cpus=room, include_dashboard=False, log_to_driver=False,
+                    logging_level=logging.ERROR, _temp_dir=place,
+                )  # fmt: skip
+        except Exception as error:
+            raise DroidwError(
+                f"--executor ray: Ray cannot be started or reached: {error}",
+                "check --ray-address, or run the cells as processes: --executor local",
+            ) from error
+        _run(cells, each, tell, limit, stopped)
+    finally:
+        ray.shutdown()
+        if place:
+            shutil.rmtree(place, ignore_errors=True)
+
+
+def _run(
+    cells: Sequence[tuple[Cell, Path]],
+    cpus: Sequence[float],
+    tell: Tell,
+    limit: float | None,
+    stopped: Callable[[], bool],
+) -> None:
+    from ray import exceptions, get, remote, wait
+
+    task: Any = remote(attend)
+    pending = {}
+    for (cell, folder), need in zip(cells, cpus, strict=True):
+        options = {"num_cpus": need, "num_gpus": cell.gpus, "max_retries": RETRIES}
+        reference = task.options(name=cell.name, **options).remote(str(folder.resolve()), limit)
+        pending[reference] = (cell, folder)
+        tell(cell, "running", None)
+    while pending and not stopped():
+        ready, _ = wait(list(pending), num_returns=1, timeout=_POLL)
+        for reference in ready:
+            cell, folder = pending.pop(reference)
+            try:
+                code, seconds = get(reference)
+            except exceptions.RayError as error:
+                lost = f"its worker was lost {RETRIES + 1} times: {str(error).splitlines()[0]}"
+                outcome = conclude(folder, 1, 0.0, lost)
+            else:
+                outcome = conclude(folder, code, seconds)
+            tell(cell, "failed" if outcome.error else "done", outcome)

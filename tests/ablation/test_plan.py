@@ -1,0 +1,220 @@
+"""Ablation files: what they mean, and what is refused before the first cell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from droidw.ablation.cells import make_cells
+from droidw.ablation.plan import load_plan
+from droidw.config.load import packaged_configs
+from droidw.errors import ConfigError, InputError, MissingRequirementError, UsageError
+from droidw.plugin.registry import PluginNotFound
+
+
+def config(cell):
+    return yaml.safe_load(cell.config)
+
+
+def by_name(cells):
+    return {cell.name: cell for cell in cells}
+
+
+def test_rows_change_what_they_say_and_nothing_else(plan, plugins):
+    found = plan(
+        {
+            "full": {},
+            "no-uncertainty": {"uncertainty": "none"},
+            "coupled": {"uncertainty": {"options": {"decoupled": False}}},
+        },
+        base={"device": "cpu", "camera": {"long_side": 200}},
+        seeds=[3, 4],
+    )
+    cells, note = make_cells(found, plugins)
+    assert note == "" and len(cells) == 3 * 2 * 2
+    assert len({cell.digest for cell in cells}) == len(cells)
+    named = by_name(cells)
+    full = config(named["full/one/seed-3"])
+    assert full["seed"] == 3 and full["camera"]["long_side"] == 200
+    assert full["input"]["source"].endswith("data/one")
+    assert Path(full["input"]["source"]).is_absolute()
+    coupled = config(named["coupled/one/seed-3"])
+    changed = full["uncertainty"]["options"] | {"decoupled": False}
+    assert coupled == {**full, "uncertainty": {"name": "affine-softplus", "options": changed}}
+    none = config(named["no-uncertainty/one/seed-3"])
+    assert none == {**full, "uncertainty": {"name": "none", "options": {}}}
+
+
+def test_layers_from_weak_to_strong(plan, plugins):
+    found = plan(
+        {"full": {}, "row": {"frontend": {"window": 30}, "uncertainty": "none"}},
+        sequences=("one",),
+        base={"device": "cpu", "frontend": {"window": 10, "radius": 3}, "backend": {"radius": 4}},
+    )
+    said = ("frontend.window=20", "uncertainty.options.lr=0.05", "threads=2")
+    cells, _ = make_cells(found, plugins, said)
+    full, row = (config(cell) for cell in cells)
+    assert (full["frontend"]["window"], row["frontend"]["window"]) == (20, 30)
+    assert full["frontend"]["radius"] == 3 and full["backend"]["radius"] == 4
+    # What the command line says of a plugin falls away where the row takes another plugin.
+    assert full["uncertainty"]["options"]["lr"] == 0.05
+    assert row["uncertainty"] == {"name": "none", "options": {}}
+    assert [cell.threads for cell in cells] == [2, 2]
+    plain, _ = make_cells(found, plugins)
+    assert [cell.threads for cell in plain] == [1, 1]
+
+
+def test_what_varies_with_the_seed(plan, plugins):
+    found = plan(["full"], vary=["input.skip"], seeds=[0, 5])
+    cells, _ = make_cells(found, plugins)
+    assert [config(c)["input"]["skip"] for c in cells] == [0, 5, 0, 5]
+    assert [config(c)["seed"] for c in cells] == [0, 5, 0, 5]
+
+
+def test_sequences_with_settings_and_sources(tmp_path, plugins):
+    (tmp_path / "footage" / "a").mkdir(parents=True)
+    file = tmp_path / "p.yaml"
+    file.write_text(
+        "preset: cpu\n"
+        "sequences:\n"
+        "  first: {source: a, camera: {fov: 70}}\n"
+        "  orbit: {source: 'synthetic:orbit', vary: [reader.options.seed], reader: synthetic}\n"
+        "vary: input.skip\n"
+        "rows: {full: {}}\n"
+        "base: {device: cpu}\n"
+    )
+    found = load_plan(str(file), data=tmp_path / "footage")
+    cells, _ = make_cells(found, plugins, preset=None)
+    first, orbit = (config(cell) for cell in cells)
+    assert first["camera"]["fov"] == 70 and orbit["camera"]["fov"] is None
+    assert first["input"] == {**orbit["input"], "source": str(tmp_path / "footage" / "a")}
+    assert orbit["input"]["source"] == "synthetic:orbit"
+    chosen = load_plan(str(file), tmp_path / "footage", ["orbit", "synthetic:static"], seeds=[7])
+    assert list(chosen.sequences) == ["orbit", "synthetic-static"]
+    assert chosen.sequences["synthetic-static"].source == "synthetic:static"
+    cells, _ = make_cells(chosen, plugins)
+    assert config(cells[0])["reader"]["options"]["seed"] == 7
+    assert (config(cells[1])["input"]["skip"], cells[1].seed) == (7, 7)
+
+
+def test_an_unknown_plugin_is_refused_with_its_row(plan, plugins, tmp_path):
+    found = plan({"full": {}, "swap": {"uncertainty": "afine-softplus"}})
+    with pytest.raises(PluginNotFound) as caught:
+        make_cells(found, plugins)
+    said = str(caught.value)
+    assert "plan.yaml:" in said and "rows.swap: uncertainty.name: no uncertainty model" in said
+    assert "did you mean 'affine-softplus'?" in said
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["data", "plan.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ({"frontend": {"windw": 3}}, "rows.bad: frontend.windw"),
+        ({"uncertainty": {"options": {"weight_decay": "much"}}}, "rows.bad: uncertainty.options"),
+        ({"uncertainty": {"options": {"weight_decay": -1}}}, "weight_decay"),
+        ({"features": "none"}, "needs features"),
+        ({"schedule": {"windo": {"updates": 1}}}, "schedule.windo: there is no such phase"),
+    ],
+)
+def test_a_row_that_does_not_fit_is_refused(plan, plugins, row, said):
+    with pytest.raises(ConfigError) as caught:
+        make_cells(plan({"full": {}, "bad": row}), plugins)
+    assert said in str(caught.value)
+
+
+def test_a_row_that_cannot_run_here_is_kept_and_told(plan, plugins):
+    found = plan({"full": {}, "file": {"depth": "file"}, "droid": {"correspondence": "droid"}})
+    cells, _ = make_cells(found, plugins)
+    missing = {cell.row for cell in cells if cell.missing}
+    assert missing == {"droid"}
+    assert all("weights" in cell.missing for cell in cells if cell.row == "droid")
+    only = plan({"droid": {"correspondence": "droid"}})
+    with pytest.raises(MissingRequirementError, match="droid"):
+        make_cells(only, plugins)
+
+
+def test_sequences_that_are_not_there(plan, plugins):
+    found = plan(["full"])
+    (Path(found.sequences["two"].source)).rmdir()
+    with pytest.raises(InputError, match=r"of 2 sequences, 1 are not there: two \("):
+        make_cells(found, plugins)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("row: {}\n", "row: no ablation has this key"),
+        ("rows: [a]\n", "rows: ['a'] is no mapping"),
+        ("rows: {a/b: {}}\n", "cannot be the name of a folder"),
+        ("rows: {a: 3}\n", "rows.a: 3 is no mapping"),
+        ("rows: {a: {}}\n", "sequences: there is none"),
+        ("sequences: [x]\n", "rows: there is none"),
+        ("rows: {a: {}}\nsequences: [x]\nseeds: [a]\n", "seeds: ['a'] is no list of whole numbers"),
+        ("rows: {a: {}}\nsequences: [x]\nmeasure: {align: sim2}\n", "measure.align: 'sim2'"),
+        ("rows: {a: {}}\nsequences: [x]\nmeasure: {after: 2}\n", "measure.after: there is no such"),
+        ("rows: {a: {}}\nsequences: [x]\nneeds: {gpu: 1}\n", "needs.gpu"),
+        ("rows: {a: {}}\nsequences: [x]\nconfig: nowhere\n", "there is no file or packaged config"),
+        ("rows: {a: {}\n", "is not YAML"),
+    ],
+)
+def test_files_that_are_no_ablation(tmp_path, text, said):
+    file = tmp_path / "p.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_plan(str(file))
+    assert said in str(caught.value) and "p.yaml" in str(caught.value)
+
+
+def test_names_that_are_not_there():
+    with pytest.raises(UsageError, match="'cpuu' is neither a file nor an ablation"):
+        load_plan("cpuu")
+    with pytest.raises(ConfigError, match="there is no such configuration file"):
+        load_plan("nowhere/cpu.yaml")
+    with pytest.raises(UsageError, match="has no row 'ful'") as caught:
+        load_plan("demo", rows=["ful"])
+    assert "did you mean 'full'?" in caught.value.hint
+
+
+PUBLISHED = {
+    "a-no-uncertainty": {"uncertainty": "none"},
+    "b-no-depth": {"depth": "none"},
+    "c-no-decoupling": {"uncertainty": {"options": {"decoupled": False}}},
+    "d-no-affine-map": {"uncertainty": "per-pixel"},
+    "e-no-weight-decay": {"uncertainty": {"options": {"weight_decay": 0}}},
+    "no-prior": {"uncertainty": {"options": {"gamma_prior": 0}}},
+}
+"""Rows of the paper's two ablation tables."""
+
+
+def test_every_published_row_is_a_row_of_paper():
+    rows = {name: tree for name, (_, tree) in load_plan("paper").rows.items()}
+    assert next(iter(rows)) == "full" and rows["full"] == {}
+    assert {name: rows.get(name) for name in PUBLISHED} == PUBLISHED
+    for slot, names in {
+        "features": {"dinov2", "cnn"},
+        "uncertainty": {"per-pixel", "mlp", "none"},
+        "ba": {"torch", "native"},
+        "depth": {"none"},
+    }.items():
+        assert names <= {tree[slot] for tree in rows.values() if isinstance(tree.get(slot), str)}
+    assert load_plan("paper").preset == "paper"
+
+
+@pytest.mark.parametrize(
+    "name", [n.partition("/")[2] for n in packaged_configs() if n.startswith("ablations/")]
+)
+def test_packaged_ablations_resolve(name, plugins, tmp_path):
+    """Every row names plugins and options that exist, whether or not they can run here."""
+    found = load_plan(name, data=tmp_path)
+    for footage in found.sequences.values():
+        if ":" not in footage.source:
+            Path(footage.source).mkdir(exist_ok=True)
+    try:
+        cells, _ = make_cells(found, plugins)
+    except MissingRequirementError:
+        assert name == "paper"  # its parts want weights, which no test has
+        return
+    assert cells and {cell.row for cell in cells} == set(found.rows)
