@@ -8,15 +8,17 @@ from torch.nn import functional as F
 
 from droidw.errors import ConfigError, InputError, MissingRequirementError
 from droidw.geometry.camera import Camera
+from droidw.io.weights_store import Known, WeightsStore
 from droidw.plugin.component import BuildContext
 from droidw.slam.frame import Frame
 from droidw.testing.conformance import check_depth_prior
-from droidw_plugins._weights import METRIC3D_VIT_LARGE, METRIC3D_VIT_SMALL
+from droidw_plugins._weights import FIT3D, METRIC3D_VIT_LARGE, METRIC3D_VIT_SMALL
 from droidw_plugins.depth import _metric3d_net as net
 from droidw_plugins.depth._metric3d import Metric3dDepth, fit_into
 from droidw_plugins.depth.metric3d import COMPONENT, Metric3dOptions
 
 CPU = torch.device("cpu")
+RECORDS = (METRIC3D_VIT_SMALL, METRIC3D_VIT_LARGE, FIT3D)
 LIMITS = {"depth": 2e-3, "confidence": 4e-4, "prediction_normal": 3e-4}
 """As suggested in ../shared/parity/networks/README.md."""
 
@@ -235,3 +237,20 @@ def test_weights_follow_the_options(tmp_path):
     assert COMPONENT.weights_for(Metric3dOptions(weights="x.pth")) == ()
     with pytest.raises(MissingRequirementError, match="'metric3d-vit-large' are not in"):
         COMPONENT.factory(Metric3dOptions(), BuildContext(CPU, weights_dir=tmp_path))
+
+
+def test_a_published_file_is_added_and_used(stand_in, prior, tmp_path):
+    """As it is published: more than weights in it, and one layer under two names."""
+    state = dict(stand_in("metric3d-vit-small"))
+    for key in state:
+        if ".norm3." in key:
+            state[key] = state[key.replace(".norm3.", ".downsample.1.")]
+    torch.save({"model_state_dict": state, "optimizer": {"step": 7}}, tmp_path / "downloaded.pth")
+    store = WeightsStore(tmp_path / "weights", {r.name: Known(r) for r in RECORDS})
+    record, _ = store.add(tmp_path / "downloaded.pth")
+    assert record == METRIC3D_VIT_SMALL
+    context = BuildContext(CPU, weights_dir=tmp_path / "weights")
+    options = Metric3dOptions(variant="vit-small", size=[56, 84])
+    found = COMPONENT.factory(options, context).predict(frame()).depth
+    # The files align tensors in memory differently, and sums may then be taken in another order.
+    assert torch.allclose(found, prior().predict(frame()).depth, rtol=1e-4)
