@@ -1,5 +1,8 @@
 """Every built-in part passes the suite of its kind, as any third-party part must."""
 
+import importlib.util
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -30,12 +33,28 @@ def footage(tmp_path_factory):
     for index in range(len(scene)):
         writer.write(np.ascontiguousarray(scene.render(index).image[..., ::-1]))
     writer.release()
+    trees = _trees()
+    trees.rgbd(root / "rgbd_bonn_made_up", count=8)
     return {
+        "bonn": str(root / "rgbd_bonn_made_up"),
+        "droidw": str(trees.walk(root / "downtown", count=8)),
+        "dycheck": str(trees.dycheck(root / "scene", numbers=range(8))),
+        "euroc": str(trees.euroc(root / "MH_00", count=8)),
+        "kitti": str(trees.kitti(root / "kitti", count=8)),
         "folder": str(root / "clip"),
         "tum": str(tum),
         "video": str(root / "clip.avi"),
         "synthetic": "synthetic:orbit",
     }
+
+
+def _trees():
+    """The maker of small datasets; test folders are not packages."""
+    path = Path(__file__).parents[1] / "datasets" / "trees.py"
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def skip_unless_ready(entry):

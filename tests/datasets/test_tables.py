@@ -45,6 +45,12 @@ def test_only_the_corrected_row_has_a_published_camera():
     assert rows[0].raw_camera().cx == 360.0
 
 
+def test_datasets_beside_the_paper_are_by_hand_and_calibrated_on_disk():
+    for name in ("kitti", "euroc"):
+        for row in load_table(name).sequences.values():
+            assert not row.archive and row.raw_camera() is None and row.ate is None
+
+
 def test_unknown_names_are_told_with_the_list():
     with pytest.raises(InputError, match="no dataset is called 'bon'") as error:
         load_table("bon")

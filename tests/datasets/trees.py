@@ -80,3 +80,54 @@ def clip(folder, numbers=(0, 1, 2, 5)):
     for n in numbers:
         picture(folder / "rgb" / f"frame{n:05d}.{'png' if n % 2 else 'jpg'}", (128, 72), 9 * n)
     return folder
+
+
+def kitti(root, name="05", count=6, size=(124, 37), baseline=0.06):
+    """sequences/NAME and poses/NAME.txt; camera 0 moves 1 m per picture along z."""
+    folder = root / "sequences" / name
+    for i in range(count):
+        picture(folder / "image_2" / f"{i:06d}.png", size, 9 * i)
+    (folder / "times.txt").write_text("".join(f"{i * 0.1037:.6e}\n" for i in range(count)))
+    zero = "70.7 0 60 0 0 70.7 18 0 0 0 1 0"
+    two = f"70.7 0 60 {70.7 * baseline} 0 70.7 18 0 0 0 1 0"
+    (folder / "calib.txt").write_text(f"P0: {zero}\nP1: {zero}\nP2: {two}\nP3: {two}\nTr: {zero}\n")
+    (root / "poses").mkdir(parents=True, exist_ok=True)
+    rows = [f"1 0 0 0 0 1 0 0 0 0 1 {i}" for i in range(count)]
+    (root / "poses" / f"{name}.txt").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+SENSOR = """# General sensor definitions.
+sensor_type: camera
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0, -1.0, 0.0, -0.02,
+         1.0, 0.0, 0.0, -0.06,
+         0.0, 0.0, 1.0, 0.01,
+         0.0, 0.0, 0.0, 1.0]
+rate_hz: 20
+resolution: [752, 480]
+camera_model: pinhole
+intrinsics: [458.654, 457.296, 367.215, 248.375]
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
+
+
+def euroc(folder, count=6, size=(752, 480), start=1403636579763555584):
+    """mav0 with the left camera at 20 Hz and the state of the body at 200 Hz, 1 m/s along x."""
+    mav = folder / "mav0"
+    rows = ["#timestamp [ns],filename"]
+    for i in range(count):
+        stamp = start + i * 50_000_000
+        picture(mav / "cam0" / "data" / f"{stamp}.png", size, 9 * i)
+        rows.append(f"{stamp},{stamp}.png")
+    (mav / "cam0" / "data.csv").write_text("\r\n".join(rows) + "\r\n")
+    (mav / "cam0" / "sensor.yaml").write_text(SENSOR)
+    states = ["#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], ..."]
+    for k in range(10 * count):
+        states.append(f"{start + k * 5_000_000},{k * 0.005},0,0,1,0,0,0,9,9,9")
+    (mav / "state_groundtruth_estimate0").mkdir(parents=True)
+    (mav / "state_groundtruth_estimate0" / "data.csv").write_text("\n".join(states) + "\n")
+    return folder

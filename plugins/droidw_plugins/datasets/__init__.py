@@ -17,12 +17,24 @@ __all__ = ["droidw_dataset_readers"]
 @hookimpl
 def droidw_dataset_readers() -> Iterable[Component[DatasetReader]]:
     """Light records only: the factory of each imports what it needs."""
-    from droidw_plugins.datasets import bonn, droidw, dycheck, folder, synthetic, tum, video
+    from droidw_plugins.datasets import (
+        bonn,
+        droidw,
+        dycheck,
+        euroc,
+        folder,
+        kitti,
+        synthetic,
+        tum,
+        video,
+    )
 
     yield bonn.COMPONENT
     yield droidw.COMPONENT
     yield dycheck.COMPONENT
+    yield euroc.COMPONENT
     yield folder.COMPONENT
+    yield kitti.COMPONENT
     yield synthetic.COMPONENT
     yield tum.COMPONENT
     yield video.COMPONENT
