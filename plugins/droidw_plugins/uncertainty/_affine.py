@@ -73,7 +73,7 @@ class AffineSoftplus:
         self._mapped = None
         y = affine(self._objective.rows(view, index, index + 1), self._parameters(view))
         u = objective.softplus(y, self._options.softplus_offset)
-        view.uncertainty[index] = u.view(view.uncertainty.shape[1:])
+        self._objective.maps.append(view, index, u.view(view.uncertainty.shape[1:]))
 
     @torch.no_grad()
     def update(self, view: UncertaintyView) -> UncertaintyReport:
@@ -116,7 +116,7 @@ class AffineSoftplus:
             y = affine(rows, theta)
             self._mapped = _Mapped(theta, first, last, y)
             u = objective.softplus(y[place], options.softplus_offset)
-            view.uncertainty[frames] = u.view(-1, *view.uncertainty.shape[1:])
+            self._objective.maps.write(view, u.view(-1, *view.uncertainty.shape[1:]))
         return theta
 
     def state_dict(self) -> dict[str, Any]:

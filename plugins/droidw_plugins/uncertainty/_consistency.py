@@ -11,6 +11,7 @@ from droidw.errors import ConfigError
 from droidw.interfaces.uncertainty import StoreField, UncertaintyReport, UncertaintyView
 from droidw_plugins.uncertainty import _objective as objective
 from droidw_plugins.uncertainty._options import ObjectiveOptions
+from droidw_plugins.uncertainty._published import Publisher
 
 __all__ = ["Consistency"]
 
@@ -57,7 +58,8 @@ class Consistency:
     Attributes:
         fields: on a CPU the features a second time with the channels last [h,w,c], and their
             lengths [h,w]: bringing a window into that order at every step would cost more than
-            the step. With `tolerance` also a serial number of the keyframe.
+            the step. With `tolerance` also a serial number of the keyframe, and those of `maps`.
+        maps: writes what was learned.
     """
 
     def __init__(self, options: ObjectiveOptions, device: torch.device, name: str) -> None:
@@ -71,7 +73,8 @@ class Consistency:
             fields += [StoreField(_ROWS, ("h", "w", "c")), StoreField(_LENGTHS, ("h", "w"))]
         if options.tolerance > 0:
             fields.append(StoreField(_SERIAL, (), dtype="int64"))
-        self.fields = tuple(fields)
+        self.maps = Publisher(options)
+        self.fields = (*fields, *self.maps.fields)
 
     def append(self, view: UncertaintyView, index: int) -> None:
         """Prepare the features of a new keyframe.
@@ -117,7 +120,7 @@ class Consistency:
         """
         options = self.options
         pairs = self._pairs_of(view)
-        u = view.uncertainty[pairs.first : pairs.last]
+        u = self.maps.learned(view)[pairs.first : pairs.last]
         pair, energy = objective.pair_gradient(
             u.flatten(1), pairs.rho, pairs.samples, options.decoupled
         )
@@ -152,11 +155,14 @@ class Consistency:
         first, last = int(touched.min()), int(touched.max()) + 1
         counts = torch.bincount(torch.cat([ii, jj]) - first, minlength=last - first)
         xy, valid = objective.project(view.T_cw, view.disps, view.intrinsics, ii, jj)
+        self.maps.weigh(view)
         samples = objective.make_samples(xy, valid, view.disps.shape[2], ii - first, jj - first)
         if options.tolerance > 0:
             cosine = self._renewed(view, samples, ii, jj, first, last)
         else:
             cosine = self._similarity(view, samples, first, last)
+        if options.bulk > 0:
+            cosine = objective.calibrated(cosine, samples, options.bulk)
         rho = objective.residual(
             cosine, samples, options.similarity_threshold, options.similarity_floor
         )

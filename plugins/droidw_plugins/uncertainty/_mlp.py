@@ -83,7 +83,7 @@ class Mlp:
         rows = self._objective.rows(view, index, index + 1)
         y, _ = forward(rows[0], self._layers(view))
         u = objective.softplus(y, self._options.softplus_offset)
-        view.uncertainty[index] = u.view(view.uncertainty.shape[1:])
+        self._objective.maps.append(view, index, u.view(view.uncertainty.shape[1:]))
 
     @torch.no_grad()
     def update(self, view: UncertaintyView) -> UncertaintyReport:
@@ -109,7 +109,7 @@ class Mlp:
             self._adam(step)
             y, _ = forward(rows, self._layers(view))
             u = objective.softplus(y, offset)
-            view.uncertainty[view.frames] = u.view(-1, *view.uncertainty.shape[1:])
+            self._objective.maps.write(view, u.view(-1, *view.uncertainty.shape[1:]))
         facts = {**report.facts, "weights_norm": float(self._state["weights"].norm())}
         return UncertaintyReport(report.energy, facts)
 

@@ -23,6 +23,7 @@ from droidw.geometry.projective import NEAR, pixel_grid, relative_pose
 
 __all__ = [
     "Samples",
+    "calibrated",
     "edges_used",
     "frame_gradient",
     "interpolate",
@@ -193,6 +194,21 @@ def similarity(features: Tensor, samples: Samples, lengths: Tensor | None = None
         torch.mv(there.mul_(there), ones, out=square[rows])
     length = lengths.index_select(0, samples.source).flatten() * square.sqrt_()
     return dot.div_(length.add_(_EPSILON)).view(n_edges, cells)
+
+
+def calibrated(cosine: Tensor, samples: Samples, bulk: float) -> Tensor:
+    """Cosines [E,P] of which the middle one of each edge is at least `1 - bulk`.
+
+    What lowers the similarity of a whole picture says nothing about what moves: an unusual
+    appearance, poses not yet found, a wide baseline. So the dissimilarity `1 - cosine` of an edge
+    is scaled down to `bulk` at its median over the cells that are inside. It holds while less
+    than half of the picture moves.
+    """
+    # Every third cell tells the median well enough, at a third of the sorting.
+    some = torch.where(samples.inside, 1.0 - cosine, math.nan)[:, ::3]
+    middle = some.nanmedian(dim=1, keepdim=True).values
+    scale = (bulk / middle.clamp_min(_EPSILON)).clamp_max_(1.0).nan_to_num_(1.0)
+    return 1.0 - (1.0 - cosine) * scale
 
 
 def residual(

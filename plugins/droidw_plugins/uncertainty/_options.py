@@ -52,6 +52,31 @@ class ObjectiveOptions:
             "false: sums, as the paper writes them, which need a far smaller step"
         },
     )
+    bulk: float = field(
+        default=0.0,
+        metadata={
+            "help": "where the middle cell of an edge is less similar than 1 - bulk, "
+            "dissimilarities are scaled so that it is not (paper: 0, off)",
+            "ge": 0,
+            "lt": 1,
+        },
+    )
+    smooth: int = field(
+        default=0,
+        metadata={"help": "write means of u over cells at most so far away (paper: 0)", "ge": 0},
+    )
+    residual_gain: float = field(
+        default=0.0,
+        metadata={
+            "help": "how much measured motion that agrees with the poses lowers u, and motion "
+            "that does not raises it (paper: 0)",
+            "ge": 0,
+            "le": 1,
+        },
+    )
+    residual_scale: float = field(
+        default=0.2, metadata={"help": "residual in cells at which agreement is a half", "gt": 0}
+    )
     refresh: int = field(
         default=1,
         metadata={"help": "similarities are renewed at every n-th step on the same edges", "ge": 1},

@@ -18,8 +18,8 @@ __all__ = ["PerPixel"]
 class PerPixel:
     """The maps themselves are the parameters: `u <- clamp(u - lr J)` (REFERENCE 4.3).
 
-    They live in the store's field `uncertainty` and so move and die with their keyframe; the model
-    has no state of its own.
+    They live in the store and so move and die with their keyframe; the model has no state of its
+    own.
 
     Args:
         options: see `PerPixelOptions`.
@@ -45,7 +45,8 @@ class PerPixel:
     def append(self, view: UncertaintyView, index: int) -> None:
         """Set the map [h,w] of a new keyframe to `start`."""
         self._objective.append(view, index)
-        view.uncertainty[index] = self._options.start
+        u = view.uncertainty.new_full(view.uncertainty.shape[1:], self._options.start)
+        self._objective.maps.append(view, index, u)
 
     @torch.no_grad()
     def update(self, view: UncertaintyView) -> UncertaintyReport:
@@ -58,10 +59,10 @@ class PerPixel:
         if view.frames.numel() == 0:
             return UncertaintyReport()
         gradient, report = self._objective.gradient(view)
-        before = view.uncertainty[view.frames]
+        before = self._objective.maps.learned(view)[view.frames]
         moved = (before - options.lr * gradient).clamp_(options.u_min, options.u_max)
         # Cells whose step is not finite keep their value.
-        view.uncertainty[view.frames] = torch.where(torch.isfinite(moved), moved, before)
+        self._objective.maps.write(view, torch.where(torch.isfinite(moved), moved, before))
         return report
 
     def state_dict(self) -> dict[str, Any]:

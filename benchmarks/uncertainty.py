@@ -1,0 +1,169 @@
+"""Time of one uncertainty update beside one bundle adjustment step, on the same window.
+
+Prints medians of calls made in turn in one process, and their ratio. The first step on given edges
+compares features; the second of the two that follow each other in a run may keep that (`refresh`).
+
+    python benchmarks/uncertainty.py [--threads 1] [--repeats 25] [--json FILE] [--quick]
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from ba_step import make_window
+
+from droidw.geometry import se3
+from droidw.interfaces.uncertainty import UncertaintyModel, UncertaintyView
+from droidw.plugin.component import BuildContext
+from droidw.solve.problem import BAProblem
+from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
+from droidw_plugins.uncertainty import affine_softplus, mlp, per_pixel
+
+WINDOWS = ((12, 36), (25, 75), (25, 150))
+CHANNELS = 64
+DRIFT = 0.002
+"""Translation of all cameras between two updates, as late iterations move them (scene units)."""
+
+CASES = (
+    ("affine-softplus", affine_softplus.COMPONENT, {}),
+    ("  tolerance 0.02", affine_softplus.COMPONENT, {"tolerance": 0.02}),
+    ("per-pixel", per_pixel.COMPONENT, {}),
+    ("mlp", mlp.COMPONENT, {}),
+)
+
+
+def main() -> None:
+    """Runs the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--threads", type=int, default=1, help="threads of torch (default 1)")
+    parser.add_argument("--repeats", type=int, default=25, help="calls per median (default 25)")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.add_argument("--quick", action="store_true", help="the smallest window only")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    # As in a run, where larger blocks were in use before: memory is not given back in between.
+    del_me = torch.ones(7_900_000)
+    del del_me
+    rows = []
+    print(f"30x40 cells, {CHANNELS} channels, {args.threads} threads, processor time, ms")
+    print(f"{'keyframes':>9} {'edges':>6} {'model':>17} {'first':>7} {'second':>7} / BA step")
+    for keyframes, edges in WINDOWS[:1] if args.quick else WINDOWS:
+        for row in measure(keyframes, edges, args.repeats):
+            rows.append(row)
+            print(
+                f"{row['keyframes']:9d} {row['edges']:6d} {row['model']:>17} "
+                f"{row['first_ms']:7.2f} {row['second_ms']:7.2f} "
+                f"{row['first_over_ba']:4.2f} {row['second_over_ba']:4.2f}",
+                flush=True,
+            )
+    if args.json:
+        record = {
+            "benchmark": "uncertainty",
+            "torch": torch.__version__,
+            "machine": platform.machine(),
+            "threads": args.threads,
+            "repeats": args.repeats,
+            "rows": rows,
+        }
+        args.json.write_text(json.dumps(record, indent=2) + "\n")
+
+
+def measure(keyframes: int, edges: int, repeats: int) -> list[dict[str, object]]:
+    """All models and the bundle adjuster in turn on one window; medians."""
+    problem = make_window(keyframes, edges, 30, 40, torch.float32)
+    adjuster = TorchBundleAdjuster()
+    models = [prepare(component, options, problem) for _, component, options in CASES]
+    step: list[float] = []
+    first: list[list[float]] = [[] for _ in CASES]
+    second: list[list[float]] = [[] for _ in CASES]
+    for count in range(repeats + 1):
+        taken = clock(lambda: adjuster.step(problem))
+        if count:  # the first round warms up
+            step.append(taken)
+        for n, (model, view) in enumerate(models):
+            # Another edge order is another set of edges, so that nothing is kept from before.
+            order = torch.arange(edges).roll(count + 1)
+            drift = torch.zeros(6)
+            drift[0] = DRIFT * (-1) ** count
+            moved = dataclasses.replace(
+                view,
+                ii=view.ii[order],
+                jj=view.jj[order],
+                T_cw=se3.retract(view.T_cw, drift * torch.arange(keyframes)[:, None] / keyframes),
+            )
+            one, two = (clock(lambda m=model, v=moved: m.update(v)) for _ in range(2))
+            if count:
+                first[n].append(one)
+                second[n].append(two)
+    ba = statistics.median(step)
+    return [
+        {
+            "keyframes": keyframes,
+            "edges": edges,
+            "model": name,
+            "ba_ms": ba,
+            "first_ms": statistics.median(first[n]),
+            "second_ms": statistics.median(second[n]),
+            "first_over_ba": statistics.median(first[n]) / ba,
+            "second_over_ba": statistics.median(second[n]) / ba,
+        }
+        for n, (name, _, _) in enumerate(CASES)
+    ]
+
+
+def prepare(
+    component: object, options: dict[str, object], problem: BAProblem
+) -> tuple[UncertaintyModel, UncertaintyView]:
+    """A model with `refresh: 2` and a view of the window with smooth random features."""
+    model = component.factory(  # type: ignore[attr-defined]
+        component.options(refresh=2, **options),  # type: ignore[attr-defined]
+        BuildContext(torch.device("cpu")),
+    )
+    n, h, w = problem.disps.shape
+    sizes = {"h": h, "w": w, "c": CHANNELS}
+    draw = torch.Generator().manual_seed(0)
+    coarse = torch.randn(1, CHANNELS, h // 5, w // 5, generator=draw)
+    features = torch.nn.functional.interpolate(coarse, (h, w), mode="bilinear")
+    features = features + 0.3 * torch.randn(n, CHANNELS, h, w, generator=draw)
+    view = UncertaintyView(
+        features=features,
+        uncertainty=torch.zeros(n, h, w),
+        fields={
+            f.name: torch.full(
+                (n, *(sizes[s] if isinstance(s, str) else s for s in f.shape)),
+                f.fill,
+                dtype=getattr(torch, f.dtype),
+            )
+            for f in model.fields
+        },
+        T_cw=problem.T_cw,
+        disps=problem.disps,
+        intrinsics=problem.intrinsics,
+        ii=problem.ii,
+        jj=problem.jj,
+        target=problem.target,
+        confidence=problem.weight,
+        frames=torch.arange(n),
+    )
+    for index in range(n):
+        model.append(view, index)
+    return model, view
+
+
+def clock(call: Callable[[], object]) -> float:
+    """Milliseconds of processor time of one call."""
+    start = time.process_time()
+    call()
+    return 1e3 * (time.process_time() - start)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,114 @@
+"""From what was learned to the map that is written: smoothing, and the evidence of residuals."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from droidw.interfaces.uncertainty import StoreField, UncertaintyView
+from droidw_plugins.uncertainty import _objective as objective
+from droidw_plugins.uncertainty._options import ObjectiveOptions
+
+__all__ = ["Publisher", "box_mean", "residual_factor"]
+
+_LEARNED = "uncertainty_learned"
+_FACTOR = "uncertainty_factor"
+_NEUTRAL = 1.0 / 3.0
+"""Agreement at which the factor is one; that of a cell of which nothing was measured."""
+_PRIOR = 0.1
+"""Confidence with which every cell starts out as neutral."""
+_FAR = 4.0
+"""Residuals beyond so many cells count as this."""
+
+
+def box_mean(maps: Tensor, radius: int) -> Tensor:
+    """Means [N,h,w] over squares of `2 radius + 1` cells, of fewer at the border."""
+    if radius == 0:
+        return maps
+    size = 2 * radius + 1
+    return F.avg_pool2d(maps, size, 1, radius, count_include_pad=False)
+
+
+def residual_factor(
+    residual: Tensor, confidence: Tensor, ii: Tensor, frames: int, scale: float, gain: float,
+    smooth: int,
+) -> Tensor:  # fmt: skip
+    """Factor [N,h,w] on the uncertainty of each cell: below one where measured motion agrees.
+
+    With r the mean residual of a cell over its edges, weighted by confidence, the agreement is
+    `A = 1 / (1 + (r / scale)^2)` and the factor `1 + gain (1/3 - A)`.
+
+    Args:
+        residual: [E,h,w] distance of measured and predicted place, cells; 0 confidence where it
+            means nothing. confidence: [E,h,w]. ii: [E] in [0, frames).
+        smooth: radius over which r is averaged.
+    """
+    weight = torch.where(torch.isfinite(residual) & torch.isfinite(confidence), confidence, 0.0)
+    cut = residual.nan_to_num(_FAR, _FAR, _FAR).clamp_max(_FAR)
+    shape = (frames, *residual.shape[1:])
+    total = weight.new_full(shape, _PRIOR).index_add_(0, ii, weight)
+    # At this residual the agreement is neutral.
+    start = _PRIOR * scale * (1.0 / _NEUTRAL - 1.0) ** 0.5
+    mean = weight.new_full(shape, start).index_add_(0, ii, weight * cut).div_(total)
+    agreement = 1.0 / (1.0 + (box_mean(mean, smooth) / scale).square_())
+    return 1.0 + gain * (_NEUTRAL - agreement)
+
+
+class Publisher:
+    """Writes maps to the store; what was learned stays apart where the two differ.
+
+    Args:
+        options: `smooth`, `residual_gain` and `residual_scale` are read.
+    Attributes:
+        fields: none by default; else the map [h,w] as learned, and the factor of `residual_factor`
+            as it was last found.
+    """
+
+    def __init__(self, options: ObjectiveOptions) -> None:
+        self._options = options
+        self._apart = options.smooth > 0 or options.residual_gain > 0
+        fields = []
+        if self._apart:
+            fields = [StoreField(_LEARNED, ("h", "w")), StoreField(_FACTOR, ("h", "w"), fill=1.0)]
+        self.fields: tuple[StoreField, ...] = tuple(fields)
+
+    def learned(self, view: UncertaintyView) -> Tensor:
+        """The maps [N,h,w] that the objective is about."""
+        return view.fields[_LEARNED] if self._apart else view.uncertainty
+
+    def append(self, view: UncertaintyView, index: int, u: Tensor) -> None:
+        """Write the map [h,w] of a new keyframe, of which no motion was measured yet."""
+        if self._apart:
+            view.fields[_LEARNED][index] = u
+            view.fields[_FACTOR][index] = 1.0
+            u = box_mean(u[None], self._options.smooth)[0]
+        view.uncertainty[index] = u
+
+    def weigh(self, view: UncertaintyView) -> None:
+        """Renew the factors of the frames that edges of the view start from."""
+        options = self._options
+        if options.residual_gain == 0 or view.ii.numel() == 0:
+            return
+        first, last = int(view.ii.min()), int(view.ii.max()) + 1
+        xy, valid = objective.project(view.T_cw, view.disps, view.intrinsics, view.ii, view.jj)
+        shape = view.target.shape[:3]
+        apart = view.target.movedim(-1, 1) - xy.view(shape[0], 2, *shape[1:])
+        factor = residual_factor(
+            torch.linalg.vector_norm(apart, dim=1),
+            view.confidence.mean(-1) * valid.view(shape),
+            view.ii - first,
+            last - first,
+            options.residual_scale,
+            options.residual_gain,
+            options.smooth,
+        )
+        starts = view.ii.unique()
+        view.fields[_FACTOR][starts] = factor[starts - first]
+
+    def write(self, view: UncertaintyView, u: Tensor) -> None:
+        """Write the maps [F,h,w] of `view.frames`."""
+        if self._apart:
+            view.fields[_LEARNED][view.frames] = u
+            u = box_mean(u, self._options.smooth) * view.fields[_FACTOR][view.frames]
+        view.uncertainty[view.frames] = u
