@@ -84,6 +84,7 @@ def download(
     target: Path,
     *,
     sha256: str = "",
+    sha256_of_before: bool = False,
     progress: Progress | None = None,
     offline: bool = False,
     attempts: int = 5,
@@ -100,6 +101,7 @@ def download(
         urls: http or https.
         target: the file to make; its folder is made as well.
         sha256: what the file must have; "" takes what the server itself states, if it does.
+        sha256_of_before: that hash is not published, but of what came from there before.
         progress: told of every block.
         offline: forbid it, as `DROIDW_OFFLINE` does.
         attempts: how often in a row a connection may break without a byte gained.
@@ -122,7 +124,7 @@ def download(
             transfer = _Transfer(url, target, part, progress, timeout)
             try:
                 transfer.run(attempts, pause)
-                transfer.check(sha256)
+                transfer.check(sha256, sha256_of_before)
             except DownloadError as error:
                 said.append(error.message)
                 continue
@@ -130,9 +132,12 @@ def download(
             os.replace(part, target)
             transfer.notes.unlink(missing_ok=True)
             return found
+        some = part.stat().st_size > 0
     raise DownloadError(
         "; ".join(said) or f"{target.name} is published nowhere",
-        "try again later; what has come is kept and gone on with",
+        "type the command again: it goes on where it stopped"
+        if some
+        else "try again later, or download it in a browser",
     )
 
 
@@ -235,16 +240,17 @@ class _Transfer:
                     ) from error
                 time.sleep(pause * 2 ** (failures - 1))
 
-    def check(self, sha256: str) -> None:
-        """Compare with what is published; a wrong file is removed."""
+    def check(self, sha256: str, of_before: bool) -> None:
+        """Compare with what is published, or came before; a wrong file is removed."""
         self.digest = sha256_of(self.part)
         self.size = self._have()
         wanted = sha256.lower() or self.redirects.digest
         if wanted and wanted != self.digest:
             self._truncate()
+            whose = "came from there before" if sha256 and of_before else "its authors publish"
             raise DownloadError(
-                f"{self.url} is not the file that its authors publish: SHA-256 is {self.digest}, "
-                f"should be {wanted}; it was removed"
+                f"{self.url} is not the file that {whose}: SHA-256 is {self.digest}, should be "
+                f"{wanted}; it was removed"
             )
 
     def _have(self) -> int:

@@ -55,7 +55,14 @@ def fetch_sequence(
     target = root / row.archive.rpartition("/")[2]
     wanted = str(_records(root).get(row.archive, {}).get("sha256", ""))
     if not (target.is_file() and wanted and sha256_of(target) == wanted):
-        got = download([row.archive], target, sha256=wanted, offline=offline, progress=download_bar)
+        got = download(
+            [row.archive],
+            target,
+            sha256=wanted,
+            sha256_of_before=True,
+            offline=offline,
+            progress=download_bar,
+        )
         _record(root, row.archive, {"sha256": got.sha256, "size": got.size})
     unpack(target, root / row.unpack, below=row.below, progress=unpack_bar)
     if not folder.is_dir():

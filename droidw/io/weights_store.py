@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from droidw.errors import DroidwError, InputError, PluginError, UsageError
-from droidw.io.download import Progress, download, sha256_of
+from droidw.io.download import DownloadError, Progress, download, sha256_of
 from droidw.io.files import atomic_write
 from droidw.io.weights import RECORDS, fingerprint, read_records, read_state
 from droidw.plugin.registry import Entry, nearest
@@ -159,9 +159,21 @@ class WeightsStore:
                 "get the file from its authors, and: droidw weights add FILE" + _page(file),
             )
         recorded = read_records(self.folder).get(file.name, {})
-        wanted = file.sha256 or str(recorded.get("published_sha256", ""))
+        before = str(recorded.get("published_sha256", ""))
         target = self.folder / (".fetched-" + (file.file or file.name + ".pth"))
-        got = download(file.urls, target, sha256=wanted, offline=offline, progress=progress)
+        try:
+            got = download(
+                file.urls,
+                target,
+                sha256=file.sha256 or before,
+                sha256_of_before=not file.sha256,
+                offline=offline,
+                progress=progress,
+            )
+        except DownloadError as error:
+            if "came from there before" in error.message:
+                error.hint = f"if a new version is to be trusted: remove {self.folder / RECORDS}"
+            raise
         try:
             state = self._checked(file, target, source=got.url)
             path = self._store(file, state, got.url, got.sha256)
@@ -186,7 +198,7 @@ class WeightsStore:
             state = self._checked(file, path)
         else:
             file, state = self._recognised(path)
-        return file, self._store(file, state, str(path.resolve()), sha256_of(path))
+        return file, self._store(file, state, str(path.resolve()), "")
 
     def verify(self, name: str) -> str:
         """Check a file on disk: its hash, where one is recorded, and every tensor.

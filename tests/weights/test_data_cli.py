@@ -95,7 +95,7 @@ def test_what_came_first_is_what_must_come_again(mirror, root, capsys):
     folder.rmdir()
     mirror.serve("/rgbd_bonn_crowd.zip", zipped({"rgbd_bonn_crowd/rgb.txt": "2 b"}), tag='"v2"')
     assert main(["data", "fetch", "bonn:crowd"]) == 5
-    assert "not the file that its authors publish" in capsys.readouterr().err
+    assert "not the file that came from there before" in capsys.readouterr().err
 
 
 def test_fetch_a_tar_and_all_of_a_dataset(mirror, root):

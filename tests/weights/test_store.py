@@ -105,8 +105,9 @@ def test_another_file_at_the_same_address_is_refused(store, site, tmp_path):
     before = path.read_bytes()
     other = saved(tmp_path / "y.pth", weights() | {"conv.bias": torch.ones(4)})
     site.serve("/acme_v2.pth", other.read_bytes(), tag='"v2"')
-    with pytest.raises(DownloadError, match="not the file that its authors publish"):
+    with pytest.raises(DownloadError, match="not the file that came from there before") as error:
         store.fetch("acme-small", force=True)
+    assert "weights.json" in error.value.hint
     assert path.read_bytes() == before
 
 
@@ -178,6 +179,9 @@ def test_a_file_is_recognised_by_its_tensors(store, tmp_path):
     file, path = store.add(saved(tmp_path / "downloaded (1).bin", wrap=""))
     assert file.name == "acme-small" and path == store.folder / "acme-small.safetensors"
     torch.testing.assert_close(read_state(path), weights())
+    # a file from anywhere says nothing of the one that is published
+    records = json.loads((store.folder / "weights.json").read_text())
+    assert records["acme-small"]["published_sha256"] == ""
     file, _ = store.add(saved(tmp_path / "b.pth", {"big": torch.ones(2)}, wrap="state_dict"))
     assert file.name == "acme-big"
 
