@@ -1,0 +1,139 @@
+"""Means, spreads, ratios, and the forms of a table."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from xml.etree import ElementTree
+
+import pytest
+
+from droidw.ablation.cells import Cell, Outcome
+from droidw.ablation.files import FILES, comma_separated, markdown, write_files
+from droidw.ablation.page import make_page
+from droidw.ablation.plan import Footage, Plan
+from droidw.ablation.table import make_table
+
+NONE = ("", {})
+
+
+def plan(rows, sequences, seeds, columns=("ate_rmse", "masks.auc")):
+    footage = {name: Footage(name, NONE) for name in sequences}
+    layers = dict.fromkeys(rows, NONE)
+    return Plan("p.yaml", "T < 1", "cpu", (), NONE, footage, tuple(seeds), layers, tuple(columns))
+
+
+def table(values, seeds=(0, 1, 2), columns=("ate_rmse", "masks.auc"), curve=None):
+    """values: (row, sequence) -> a figure per seed; a text is an error, None has not run."""
+    rows = list(dict.fromkeys(row for row, _ in values))
+    sequences = list(dict.fromkeys(sequence for _, sequence in values))
+    cells = []
+    for (row, sequence), figures in values.items():
+        for seed, value in zip(seeds, figures, strict=True):
+            outcome = None
+            if isinstance(value, str):
+                outcome = Outcome({}, {}, {}, value, 4)
+            elif value is not None:
+                metrics = {"ate_rmse": value, "masks.auc": 1 - value / 10, "odd": 5.0}
+                outcome = Outcome(metrics, {"unit": "m"}, curve or {}, seconds=2.0)
+            cells.append((Cell(row, sequence, seed, "seed: 1\n"), outcome))
+    return make_table(plan(rows, sequences, seeds, columns), cells)
+
+
+FULL = table(
+    {
+        ("full", "a"): [1.0, 2.0, 3.0],
+        ("full", "b"): [4.0, 4.0, 4.0],
+        ("worse", "a"): [4.0, 4.0, 4.0],
+        ("worse", "b"): [2.0, "no | luck", 2.0],
+        ("lost", "a"): ["a", "b", "c"],
+        ("lost", "b"): [1.0, 1.0, None],
+    }
+)
+
+
+def test_means_and_spreads():
+    entry = FULL.entry("ate_rmse", "full", "a")
+    assert (entry.mean, entry.spread, entry.values) == (2.0, 1.0, (1.0, 2.0, 3.0))
+    some = FULL.entry("ate_rmse", "worse", "b")
+    assert (some.mean, some.spread, some.wanted) == (2.0, 0.0, 3)
+    assert some.errors == ("no | luck",)
+    lost = FULL.entry("ate_rmse", "lost", "a")
+    assert (lost.mean, lost.spread, lost.errors) == (None, None, ("a", "b", "c"))
+    assert FULL.entry("ate_rmse", "lost", "b").errors == ("not run",)
+    one = table({("full", "a"): [1.0]}, seeds=(0,)).entry("ate_rmse", "full", "a")
+    assert (one.mean, one.spread) == (1.0, None)
+
+
+def test_averages_and_ratios():
+    assert FULL.average("ate_rmse", "full") == 3.0
+    assert FULL.average("ate_rmse", "lost") is None
+    # Twice as bad on one sequence and half as bad on the other is as bad.
+    assert FULL.ratio("ate_rmse", "worse") == pytest.approx(1.0)
+    assert FULL.ratio("ate_rmse", "full") == 1.0 and FULL.ratio("ate_rmse", "lost") is None
+    doubled = table({("full", "a"): [0.1], ("r", "a"): [0.2]}, seeds=(0,))
+    assert doubled.ratio("ate_rmse", "r") == pytest.approx(2.0)
+    nothing = table({("full", "a"): [0.0], ("r", "a"): [0.2]}, seeds=(0,))
+    assert nothing.ratio("ate_rmse", "r") is None
+
+
+def test_a_figure_that_not_every_sequence_has():
+    found = table({("full", "a"): [1.0], ("full", "b"): ["x"]}, seeds=(0,))
+    assert found.having("ate_rmse") == ("a",)
+    assert found.grid(found.columns[0]) == [["", "a", "x full"], ["full", "1.0000", "1.00"]]
+    none = table({("full", "a"): ["x"]}, seeds=(0,))
+    assert none.columns == () and none.failures()[0][1] == "x"
+    assert "Without a result" in markdown(none) and make_page(none)
+
+
+def test_markdown():
+    text = markdown(FULL, "droidw ablate p.yaml")
+    lines = text.splitlines()
+    assert lines[0] == "# T < 1" and "    droidw ablate p.yaml" in lines
+    assert "## ATE rmse, all frames [m] (less is better)" in lines
+    assert "|  | a | b | mean | x full |" in lines
+    assert "| full | 2.0000 ± 1.0000 | 4.0000 ± 0.0000 | 3.0000 | 1.00 |" in lines
+    assert "| worse | 4.0000 ± 0.0000 | 2.0000 ± 0.0000 (2 of 3) | 3.0000 | 1.00 |" in lines
+    assert "| lost | failed | 1.0000 ± 0.0000 (2 of 3) | - | - |" in lines
+    assert "- `worse/b/seed-1`: no | luck" in lines and "- `lost/b/seed-2`: not run" in lines
+
+
+def test_csv_has_every_cell_and_every_figure():
+    rows = list(csv.DictReader(io.StringIO(comma_separated(FULL))))
+    assert len(rows) == 18
+    assert rows[0] == {
+        "row": "full", "sequence": "a", "seed": "0", "error": "",
+        "ate_rmse": "1.0", "masks.auc": "0.9", "odd": "5.0",
+    }  # fmt: skip
+    failed = [row for row in rows if row["error"]]
+    assert len(failed) == 5 and all(row["ate_rmse"] == "" for row in failed)
+
+
+def test_json(tmp_path):
+    written = write_files(FULL, tmp_path)
+    assert [path.name for path in written] == list(FILES)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted(FILES)
+    record = json.loads((tmp_path / "table.json").read_text(), parse_constant=pytest.fail)
+    assert record["figures"]["ate_rmse"]["full"]["a"]["mean"] == 2.0
+    assert record["columns"] == ["ate_rmse", "masks.auc"] and len(record["cells"]) == 18
+    assert record["cells"][0]["folder"] == "cells/full/a/seed-0"
+
+
+def test_page():
+    s = [0.1 * k for k in range(20)]
+    path = [[math.cos(x), x, 0.0] for x in s]
+    curve = {"unit": "m", "times": s, "errors": s, "path": path, "truth": path}
+    found = table({("full", "a"): [1.0, 2.0, 3.0], ("r", "a"): [2.0, 2.0, "<b>"]}, curve=curve)
+    text = make_page(found, "droidw ablate 'a & b'")
+    assert "<h1>T &lt; 1</h1>" in text and "5 of 6 cells have a result" in text
+    assert "droidw ablate &#x27;a &amp; b&#x27;" in text and "&lt;b&gt;" in text
+    # Two bar charts, the errors and the paths.
+    assert text.count("<svg") == 4 and "<script" not in text
+    # One tree: every element is closed.
+    for open_ended in ("<!doctype html>", "<meta charset='utf-8'>"):
+        text = text.replace(open_ended, "")
+    ElementTree.fromstring(text.replace("<meta name='viewport' content='width=device-width'>", ""))
+    assert text.count("class='best'") == 2  # ATE and AUC, one sequence
+    assert make_page(found, "x") == make_page(found, "x")
