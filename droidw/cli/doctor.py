@@ -17,6 +17,7 @@ from typing import Any
 
 from droidw.config.schema import DroidwConfig, SlotConfig
 from droidw.errors import DroidwError
+from droidw.io.dataset_tables import data_root
 from droidw.plugin.manager import Plugins, load_plugins
 from droidw.plugin.registry import KINDS, SLOTS
 
@@ -127,9 +128,11 @@ def _machine(found: Diagnosis, torch: Any) -> None:
 def _folders(found: Diagnosis, plugins: Plugins) -> None:
     weights = plugins.weights_dir
     files = sorted(p.name for p in weights.iterdir() if p.is_file()) if weights.is_dir() else []
+    data = data_root()
     cache = weights.parent
     found.facts["folders"] = {
         "weights": f"{weights} ({', '.join(files) if files else 'empty'})",
+        "data": f"{data} ({'there' if data.is_dir() else 'not there'})",
         "cache": f"{cache} ({'writable' if _writable(cache) else 'not writable'})",
         "here": f"{Path.cwd()} ({'writable' if _writable(Path.cwd()) else 'not writable'})",
     }

@@ -178,3 +178,35 @@ def test_none_knows_nothing() -> None:
     prior = NONE.factory(NONE.options(), CPU)
     assert prior.predict(_frame()) is None
     assert not prior.metric
+
+
+def test_the_maps_of_a_named_sequence(tmp_path: Path) -> None:
+    """Their folder and their scale are in the table; times tell which belongs to a picture."""
+    folder = tmp_path / "Bonn" / "rgbd_bonn_balloon"
+    (folder / "depth").mkdir(parents=True)
+    _png(folder / "depth" / "a.png", 10000)
+    (folder / "depth.txt").write_text("# depth maps\n7.51 depth/a.png\n")
+    context = BuildContext(torch.device("cpu"), data_dir=tmp_path)
+
+    def prior(path: str, **options: float) -> FileDepth:
+        return COMPONENT.factory(FileDepthOptions(path=path, **options), context)  # type: ignore
+
+    assert _depth(prior("bonn:balloon"), _frame(time=7.5)) == pytest.approx(2.0)
+    assert _depth(prior("bonn:balloon", scale=1000.0), _frame(time=7.5)) == pytest.approx(10.0)
+    with pytest.raises(InputError, match="has no sequence 'baloon'"):
+        prior("bonn:baloon")
+    with pytest.raises(ConfigError, match="droidw:downtown1 has no depth maps"):
+        prior("droidw:downtown1")
+    with pytest.raises(InputError, match=r"there is no folder or list .*rgbd_bonn_crowd"):
+        prior("bonn:crowd")
+
+
+def test_depth_of_dycheck_by_name(tmp_path: Path) -> None:
+    folder = tmp_path / "DyCheck" / "apple" / "depth" / "1x"
+    folder.mkdir(parents=True)
+    for number in (0, 3):
+        np.save(folder / f"0_{number:05d}.npy", np.full((4, 6, 1), 1.0 + number, np.float32))
+    context = BuildContext(torch.device("cpu"), data_dir=tmp_path)
+    prior = COMPONENT.factory(FileDepthOptions(path="dycheck:apple"), context)
+    assert isinstance(prior, FileDepth)
+    assert _depth(prior, _frame(index=1, name="0_00003.png")) == pytest.approx(4.0)

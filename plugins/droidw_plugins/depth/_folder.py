@@ -27,6 +27,7 @@ __all__ = ["FileDepth", "read_depth"]
 
 _SUFFIXES = (".png", ".npy", ".npz")
 _LIST = "depth.txt"
+_MILLIMETRES = 1000.0
 _log = logging.getLogger(__name__)
 
 
@@ -108,7 +109,7 @@ class FileDepth:
                 )
             return None
         self.found += 1
-        depth = read_depth(file, self._options.scale)
+        depth = read_depth(file, self._options.scale or _MILLIMETRES)
         if self._options.max_depth > 0:
             depth[depth > self._options.max_depth] = 0.0
         height, width = frame.image.shape[-2:]

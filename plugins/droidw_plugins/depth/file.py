@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 from droidw.plugin.component import BuildContext, Component
@@ -21,12 +21,16 @@ class FileDepthOptions:
         default="",
         metadata={
             "help": "folder of depth maps (.png of 16 bit, .npy, .npz), or a list of them as "
-            "depth.txt: 'time file' in each line"
+            "depth.txt: 'time file' in each line, or a sequence such as bonn:balloon"
         },
     )
     scale: float = field(
-        default=1000.0,
-        metadata={"help": "values of a .png per metre (1000: millimetres)", "gt": 0},
+        default=0.0,
+        metadata={
+            "help": "values of a .png per metre (0: 1000, which is millimetres, or what is known "
+            "of the named sequence)",
+            "ge": 0,
+        },
     )
     match: Literal["auto", "index", "name", "time"] = field(
         default="auto",
@@ -49,7 +53,25 @@ class FileDepthOptions:
 def _build(options: FileDepthOptions, context: BuildContext) -> DepthPrior:
     from droidw_plugins.depth._folder import FileDepth
 
-    return FileDepth(options)
+    return FileDepth(_located(options, context))
+
+
+def _located(options: FileDepthOptions, context: BuildContext) -> FileDepthOptions:
+    """The options with the folder and the scale that a name such as `bonn:balloon` means."""
+    from droidw.errors import ConfigError
+    from droidw.io.dataset_tables import data_root, load_table, split_source, table_names
+
+    parted = split_source(options.path)
+    if parted is None or parted[0] not in table_names():
+        return options
+    row = load_table(parted[0]).sequence(parted[1])
+    if not row.depth:
+        raise ConfigError(
+            f"depth.options.path: {row.source} has no depth maps", "name a folder, or depth=none"
+        )
+    folder = (context.data_dir or data_root()) / row.folder / str(row.depth["path"])
+    scale = options.scale or float(row.depth["scale"])
+    return replace(options, path=str(folder), scale=scale)
 
 
 COMPONENT: Component[DepthPrior] = Component(
