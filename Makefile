@@ -3,6 +3,7 @@
 # make lint    ruff and mypy, as CI runs them
 # make slow    the tests marked slow
 # make bench   the benchmarks (ARGS="..." goes to them)
+# make cuda-check  the CUDA kernels for all architectures: needs nvcc, no GPU
 # make clean   remove .venv and caches; runs/ stays
 #
 # The first use sets up .venv; later ones re-use it until pyproject.toml or constraints.txt changes.
@@ -13,7 +14,7 @@ ARGS ?=
 BIN := .venv/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow lint bench clean
+.PHONY: help setup demo test slow lint bench cuda-check clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -42,6 +43,9 @@ lint:
 bench:
 	@.ci/setup test
 	@$(BIN)/python benchmarks/end_to_end.py $(ARGS)
+
+cuda-check:
+	@.ci/cuda-check $(ARGS)
 
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache build dist *.egg-info

@@ -67,7 +67,19 @@ def native_backend(**options):
     return NativeBundleAdjuster(NativeBundleOptions(**options))
 
 
-BACKENDS = {"torch": torch_backend, "native": native_backend}
+def host_backend(**options):
+    """The kernels of backend cuda, their threads run in a loop on the CPU."""
+    from droidw_plugins.bundle._build import BuildError
+    from droidw_plugins.bundle._kernel_calls import KernelLibrary
+    from droidw_plugins.bundle._kernel_step import KernelStepper
+
+    try:
+        return KernelStepper(KernelLibrary.for_host(), **options)
+    except BuildError as error:
+        pytest.skip(f"the kernels cannot be compiled here: {error}")
+
+
+BACKENDS = {"torch": torch_backend, "native": native_backend, "host": host_backend}
 
 
 @pytest.fixture(params=BACKENDS)

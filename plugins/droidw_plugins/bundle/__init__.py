@@ -17,8 +17,9 @@ __all__ = ["droidw_ba_backends"]
 @hookimpl
 def droidw_ba_backends() -> Iterable[Component[BundleAdjuster]]:
     """Light records only: the factory of each imports what it needs."""
-    from droidw_plugins.bundle import auto_ba, native_ba, torch_ba
+    from droidw_plugins.bundle import auto_ba, cuda_ba, native_ba, torch_ba
 
     yield auto_ba.COMPONENT
+    yield cuda_ba.COMPONENT
     yield native_ba.COMPONENT
     yield torch_ba.COMPONENT

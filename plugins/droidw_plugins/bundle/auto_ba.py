@@ -45,28 +45,26 @@ class AutoBundleAdjuster:
 
 
 def _build(options: AutoBundleOptions, context: BuildContext) -> BundleAdjuster:
-    """On a CPU `native` where a compiler is there, else `torch`."""
-    from droidw_plugins.bundle import native_ba, torch_ba
+    """`cuda` on a GPU and `native` on a CPU if their kernels can be compiled, else `torch`."""
+    from droidw_plugins.bundle import cuda_ba, native_ba, torch_ba
 
-    built: AutoBundleAdjuster | None = None
-    if context.device.type == "cpu":
-        try:
-            backend = native_ba.COMPONENT.factory(
-                native_ba.NativeBundleOptions(halvings=options.halvings), context
-            )
-            why = "compiled for this processor"
-            built = AutoBundleAdjuster("native", why, backend)
-        except MissingRequirementError as error:
-            why = str(error)
-    else:
-        why = f"the one that runs on {context.device.type}"
-    if built is None:
+    backend: BundleAdjuster
+    chosen, kind = ("cuda", "GPU") if context.device.type == "cuda" else ("native", "processor")
+    try:
+        if chosen == "cuda":
+            made = cuda_ba.CudaBundleOptions(halvings=options.halvings)
+            backend = cuda_ba.COMPONENT.factory(made, context)
+        else:
+            native = native_ba.NativeBundleOptions(halvings=options.halvings)
+            backend = native_ba.COMPONENT.factory(native, context)
+        reason = f"its kernels are compiled for this {kind}"
+    except MissingRequirementError as error:
+        chosen, reason = "torch", str(error)
         backend = torch_ba.TorchBundleAdjuster(
             torch_ba.TorchBundleOptions(halvings=options.halvings)
         )
-        built = AutoBundleAdjuster("torch", why, backend)
-    _log.info("ba: auto takes '%s': %s", built.chosen, built.reason)
-    return built
+    _log.info("ba: auto takes '%s': %s", chosen, reason)
+    return AutoBundleAdjuster(chosen, reason, backend)
 
 
 COMPONENT: Component[BundleAdjuster] = Component(

@@ -1,0 +1,5 @@
+// The kernels of cuda.cu on a CPU, one thread after the other: so that their mathematics is tested
+// on machines without a GPU. `native.cpp` is the fast way on a CPU.
+#include "launch.h"
+
+DW_API const char* dw_error_text(int32_t) { return ""; }
