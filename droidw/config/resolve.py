@@ -21,7 +21,7 @@ from droidw.config.schema import DroidwConfig
 from droidw.errors import ConfigError, DroidwError, MissingRequirementError, PluginError
 from droidw.plugin.component import Component
 from droidw.plugin.manager import Plugins
-from droidw.plugin.registry import SLOTS, Entry, PluginNotFound, nearest
+from droidw.plugin.registry import FETCH, SLOTS, Entry, PluginNotFound, nearest
 
 __all__ = ["COMPAT", "ResolvedConfig", "choose_preset", "resolve"]
 
@@ -211,6 +211,10 @@ def _joined(problems: Sequence[DroidwError], loaded: LoadedConfig) -> DroidwErro
     """One error for all parts that are missing: nobody wants to learn of them one by one."""
     first, *others = problems
     hint = first.hint + "".join(f"\nalso: {other.message}" for other in others)
+    lines = [line for problem in problems for line in problem.hint.splitlines()]
+    names = [line.removeprefix(FETCH) for line in lines if line.startswith(FETCH)]
+    if len(names) > 1:
+        hint += f"\nall of them: droidw weights fetch {' '.join(dict.fromkeys(names))}"
     if loaded.preset and f"{loaded.preset}.yaml:" in first.message.partition(": ")[0] + ":":
         hint += (
             f"\npreset '{loaded.preset}' names these parts; --preset auto takes what can run here"

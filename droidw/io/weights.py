@@ -24,6 +24,7 @@ __all__ = ["RECORDS", "find", "fingerprint", "load_state", "read_records", "read
 RECORDS = "weights.json"
 """File beside the weights that says what each of them is, with its hash."""
 
+_AGAIN = "get it again: droidw weights fetch NAME   (names: droidw weights list)"
 _WRAPPERS = ("state_dict", "model", "model_state_dict")
 
 
@@ -109,7 +110,7 @@ def read_state(path: Path) -> dict[str, Tensor]:
     if looks_like_html(head):
         raise InputError(
             f"{path} is a web page, not weights: a site answered with a page instead of the file",
-            "remove it and fetch it again: droidw weights fetch NAME (names: droidw weights list)",
+            _AGAIN,
         )
     # Eight bytes of length, then JSON: the ending of the name may be wrong.
     is_safetensors = head[8:9] == b"{" or path.suffix == ".safetensors"
@@ -170,10 +171,11 @@ def _plain_numbers_of_numpy() -> Iterator[None]:
 
 
 def _broken(path: Path, error: Exception) -> InputError:
-    said = re.split(r"\. |\n", str(error).strip())[0] or type(error).__name__
+    said = re.sub(r"\[enforce fail[^\]]*\][ .]*", "", str(error)).strip()
+    said = re.split(r"\. |\n", said)[0] or type(error).__name__
     return InputError(
         f"{path} cannot be read as weights: it is cut short, damaged or something else ({said})",
-        "remove it and fetch it again: droidw weights fetch NAME (names: droidw weights list)",
+        _AGAIN,
     )
 
 

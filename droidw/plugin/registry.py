@@ -13,7 +13,17 @@ from droidw.errors import ConfigError, MissingRequirementError, PluginError
 from droidw.plugin.component import Component
 from droidw.plugin.weights import find_weights, weights_name
 
-__all__ = ["KINDS", "SLOTS", "Entry", "Failure", "Kind", "PluginNotFound", "Registry", "nearest"]
+__all__ = [
+    "FETCH",
+    "KINDS",
+    "SLOTS",
+    "Entry",
+    "Failure",
+    "Kind",
+    "PluginNotFound",
+    "Registry",
+    "nearest",
+]
 
 
 class PluginNotFound(ConfigError):
@@ -45,6 +55,9 @@ KINDS: Mapping[str, Kind] = {
     )
 }
 """Every kind by name, in the order in which they are listed."""
+
+FETCH = "download them: droidw weights fetch "
+"""How the line of a hint begins that says how to get weights that are missing."""
 
 SLOTS: tuple[str, ...] = ("features", "depth", "uncertainty", "ba", "correspondence", "reader")
 """Kinds of which a run has exactly one; the key in the configuration is the name of the kind."""
@@ -229,7 +242,7 @@ class Registry:
                 f"'{name}' is registered but cannot run: its weights "
                 + ", ".join(f"'{w}'" for w in weights)
                 + f" are not in {self.weights_dir or 'any folder: none is set'}",
-                "".join(f"download them: droidw weights fetch {w}\n" for w in weights)
+                "".join(f"{FETCH}{w}\n" for w in weights)
                 + "or add a file that is on disk: droidw weights add FILE\n"
                 "or name the folder that has them: DROIDW_WEIGHTS=FOLDER" + self._instead(name),
             )

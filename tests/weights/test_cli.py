@@ -133,3 +133,11 @@ def test_sizes_and_bar(capsys):
     quiet = Terminal()
     Bar("net", quiet=True, stream=quiet)(1000, 1000)
     assert quiet.text == ""
+
+
+def test_the_preset_paper_names_all_that_is_missing_at_once(capsys, tmp_path):
+    assert main(["run", str(tmp_path), "--preset", "paper", "-o", str(tmp_path / "run")]) == 5
+    error = capsys.readouterr().err
+    line = next(li for li in error.splitlines() if "all of them: droidw weights fetch" in li)
+    assert {"fit3d", "metric3d-vit-large", "droid"} <= set(line.split())
+    assert not (tmp_path / "run").exists()
