@@ -47,7 +47,9 @@ class DroidNet(nn.Module):
         with torch.device("meta"):
             net = cls()
         net.load_state_dict(tensors, strict=True, assign=True)
-        return net.requires_grad_(False).eval()
+        net.requires_grad_(False).eval()
+        net.update.fuse()
+        return net
 
     def features(self, images: Tensor) -> Tensor:
         """Features [B,128,h,w] of RGB pictures [B,3,H,W] in [0,1]."""

@@ -51,6 +51,28 @@ class Still:
     q: Tensor
 
 
+@dataclass(frozen=True)
+class _Fused:
+    """Weights of the gates z and r and of the candidate q, by what they read, put together once.
+
+    Attributes:
+        zr, q: of hidden state, correlation and flow. zrq_inp, zrq_corr: of all three.
+        zr_still, q_flow, q_net: without correlation, for the motion filter.
+        everywhere: weight and bias of the global context, the biases of the gates in it.
+        heads: weight and bias of `delta`, `weight` and aggregation.
+    """
+
+    zr: Tensor
+    q: Tensor
+    zrq_inp: Tensor
+    zrq_corr: Tensor
+    zr_still: Tensor
+    q_flow: Tensor
+    q_net: Tensor
+    everywhere: tuple[Tensor, Tensor]
+    heads: tuple[Tensor, Tensor]
+
+
 class _GRU(nn.Module):
     """Parameters of the ConvGRU with global context; `UpdateOperator` computes with them."""
 
@@ -71,13 +93,6 @@ class _GRU(nn.Module):
     def q(self, *inputs: slice) -> Tensor:
         """Weights [128,...,3,3] of the candidate for these inputs."""
         return _columns(self.convq.weight, inputs)
-
-    def everywhere(self, net: Tensor) -> Tensor:
-        """Share of the global context and all biases in z, r and q, [E,384,1,1]."""
-        g = (torch.sigmoid(self.w(net)) * net).mean(dim=(2, 3))
-        weight, bias = _together(self.convz_glo, self.convr_glo, self.convq_glo)
-        _, own = _together(self.convz, self.convr, self.convq)
-        return F.linear(g, weight.flatten(1), bias + own)[:, :, None, None]
 
 
 class _Aggregation(nn.Module):
@@ -109,6 +124,32 @@ class UpdateOperator(nn.Module):
         self.delta = _head()
         self.gru = _GRU()
         self.agg = _Aggregation()
+        self._fused: _Fused | None = None
+
+    def fuse(self) -> None:
+        """Put weights together that work together; to be called whenever they have changed."""
+        gru = self.gru
+        weight, bias = _together(gru.convz_glo, gru.convr_glo, gru.convq_glo)
+        _, own = _together(gru.convz, gru.convr, gru.convq)
+        self._fused = _Fused(
+            zr=_last(gru.zr(_NET, _CORR, _FLOW)),
+            q=_last(gru.q(_NET, _CORR, _FLOW)),
+            zrq_inp=_last(torch.cat([gru.zr(_INP), gru.q(_INP)])),
+            zrq_corr=_last(torch.cat([gru.zr(_CORR), gru.q(_CORR)])),
+            zr_still=_last(gru.zr(_NET, _FLOW)),
+            q_flow=_last(gru.q(_FLOW)),
+            q_net=_last(gru.q(_NET)),
+            everywhere=(weight.flatten(1), bias + own),
+            heads=_together(self.delta[0], self.weight[0], self.agg.conv1),
+        )
+
+    @property
+    def fused(self) -> _Fused:
+        """The weights put together by `fuse`."""
+        if self._fused is None:
+            self.fuse()
+        assert self._fused is not None
+        return self._fused
 
     def forward(
         self,
@@ -131,34 +172,34 @@ class UpdateOperator(nn.Module):
         """
         if motion is None:
             motion = corr.new_zeros(corr.shape[0], 4, *corr.shape[2:])
-        of_source = self._of_source(inp)
+        fused = self.fused
+        of_source = F.conv2d(inp, fused.zrq_inp, padding=1)
         if which is not None:
             of_source = of_source[which]
-        add = self.gru.everywhere(net) + of_source
+        add = of_source + self._everywhere(net)
         rest = torch.cat([self.corr_encoder(corr), self.flow_encoder(motion)], dim=1)
-        zr = F.conv2d(torch.cat([net, rest], 1), self.gru.zr(_NET, _CORR, _FLOW), padding=1)
+        zr = F.conv2d(torch.cat([net, rest], 1), fused.zr, padding=1)
         z, r = torch.sigmoid(zr + add[:, :256]).chunk(2, dim=1)
-        q = F.conv2d(torch.cat([r * net, rest], 1), self.gru.q(_NET, _CORR, _FLOW), padding=1)
+        q = F.conv2d(torch.cat([r * net, rest], 1), fused.q, padding=1)
         net = torch.lerp(net, torch.tanh(q + add[:, 256:]).to(net.dtype), z.to(net.dtype))
         return self._heads(net, aggregate)
 
     def still(self, net: Tensor, inp: Tensor) -> Still:
         """The part of a round without motion features that depends on the reference alone."""
         flow = self.flow_encoder(net.new_zeros(1, 4, *net.shape[2:]))
-        add = self.gru.everywhere(net) + self._of_source(inp)
-        zr = F.conv2d(torch.cat([net, flow], 1), self.gru.zr(_NET, _FLOW), padding=1)
-        q = F.conv2d(flow, self.gru.q(_FLOW), padding=1)
+        add = F.conv2d(inp, self.fused.zrq_inp, padding=1) + self._everywhere(net)
+        zr = F.conv2d(torch.cat([net, flow], 1), self.fused.zr_still, padding=1)
+        q = F.conv2d(flow, self.fused.q_flow, padding=1)
         return Still(net, zr + add[:, :256], q + add[:, 256:])
 
     def drift(self, still: Still, corr: Tensor) -> Tensor:
         """`delta` [h,w,2] of a round without motion features, float32."""
         seen = self.corr_encoder(corr)
-        weight = torch.cat([self.gru.zr(_CORR), self.gru.q(_CORR)])
-        zrq = F.conv2d(seen, weight, padding=1)
+        zrq = F.conv2d(seen, self.fused.zrq_corr, padding=1)
         z, r = torch.sigmoid(zrq[:, :256] + still.zr).chunk(2, dim=1)
-        q = zrq[:, 256:] + still.q + F.conv2d(r * still.net, self.gru.q(_NET), padding=1)
+        q = zrq[:, 256:] + still.q + F.conv2d(r * still.net, self.fused.q_net, padding=1)
         net = torch.lerp(still.net, torch.tanh(q).to(still.net.dtype), z.to(still.net.dtype))
-        return _last(self.delta(net))[0]
+        return _cells(self.delta(net))[0]
 
     def damping(self, features: Tensor) -> Tensor:
         """`eta` [U,h,w] float32 out of `features`."""
@@ -174,17 +215,19 @@ class UpdateOperator(nn.Module):
         mask: Tensor = self.agg.upmask(features)
         return mask
 
-    def _of_source(self, inp: Tensor) -> Tensor:
-        """Share of the context in z, r and q, [U,384,h,w]."""
-        return F.conv2d(inp, torch.cat([self.gru.zr(_INP), self.gru.q(_INP)]), padding=1)
+    def _everywhere(self, net: Tensor) -> Tensor:
+        """Share of the global context and all biases in z, r and q, [E,384,1,1]."""
+        g = (torch.sigmoid(self.gru.w(net)) * net).mean(dim=(2, 3))
+        return F.linear(g, *self.fused.everywhere)[:, :, None, None]
 
     def _heads(self, net: Tensor, aggregate: bool) -> Update:
         """All 3x3 convolutions of the new hidden state at once."""
-        first = [self.delta[0], self.weight[0]]
-        weight, bias = _together(*first, self.agg.conv1) if aggregate else _together(*first)
+        weight, bias = self.fused.heads
+        if not aggregate:
+            weight, bias = weight[:256], bias[:256]
         hidden = F.relu(F.conv2d(net, weight, bias, padding=1), inplace=True)
-        delta = _last(self.delta[2](hidden[:, :128]))
-        sure = torch.sigmoid(_last(self.weight[2](hidden[:, 128:256])))
+        delta = _cells(self.delta[2](hidden[:, :128]))
+        sure = torch.sigmoid(_cells(self.weight[2](hidden[:, 128:256])))
         return Update(net, delta, sure, hidden[:, 256:] if aggregate else None)
 
 
@@ -205,6 +248,10 @@ def _columns(weight: Tensor, inputs: tuple[slice, ...]) -> Tensor:
     return torch.cat([weight[:, part] for part in inputs], dim=1)
 
 
-def _last(maps: Tensor) -> Tensor:
+def _last(weight: Tensor) -> Tensor:
+    return weight.contiguous(memory_format=torch.channels_last)
+
+
+def _cells(maps: Tensor) -> Tensor:
     """[E,2,h,w] in any precision as [E,h,w,2] float32."""
     return maps.permute(0, 2, 3, 1).float().contiguous()
