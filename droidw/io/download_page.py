@@ -18,7 +18,7 @@ def looks_like_html(head: bytes) -> bool:
 
 def page_title(page: str) -> str:
     """The title of a web page, or ""."""
-    return " ".join(_parsed(page).title.split())
+    return " ".join(_Page(page).title.split())
 
 
 def confirmed_link(url: str, page: str) -> str:
@@ -27,7 +27,7 @@ def confirmed_link(url: str, page: str) -> str:
     Google Drive asks so before it hands out a file that is too large for its virus scan: with a
     form of hidden fields, or in earlier years with a link. Only links to the same site count.
     """
-    found = _parsed(page)
+    found = _Page(page)
     if found.form and any(name == "confirm" for name, _ in found.fields):
         link = urllib.parse.urljoin(url, found.form)
         separator = "&" if urllib.parse.urlsplit(link).query else "?"
@@ -48,7 +48,7 @@ def _site(host: str | None) -> str:
     return "google" if google else name
 
 
-class _parsed(HTMLParser):  # noqa: N801 - called like a function
+class _Page(HTMLParser):
     """Title, form and confirmation link of a page."""
 
     def __init__(self, page: str) -> None:

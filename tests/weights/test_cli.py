@@ -106,6 +106,21 @@ def test_a_part_without_its_weights_says_what_to_type(capsys, tmp_path):
     assert "droidw weights fetch acme-small" in error
 
 
+def test_which_weights_are_missing_depends_on_the_options(capsys, tmp_path):
+    arguments = ["run", str(tmp_path), "depth=acme", "depth.options.size=big", *PLUGIN]
+    assert main(arguments) == 5
+    assert "its weights 'acme-big' are not in" in capsys.readouterr().err
+    torch.save({"big": torch.ones(1)}, tmp_path / "x.pth")
+    assert main(["weights", "add", str(tmp_path / "x.pth"), *PLUGIN]) == 0
+    capsys.readouterr()
+    assert main(["run", str(tmp_path / "none"), "depth=acme", *PLUGIN]) == 5
+    assert "its weights 'acme-small' are not in" in capsys.readouterr().err
+    # with its weights there, the part is taken, and it is the source that is missing
+    arguments[1] = str(tmp_path / "none")
+    assert main([*arguments, "-o", str(tmp_path / "run")]) == 3
+    assert "there is no such file or folder" in capsys.readouterr().err
+
+
 def test_sizes_and_bar(capsys):
     assert [amount(n) for n in (0, 999, 88_200_000, 1_648_000_000)] == [
         "", "999 B", "88 MB", "1.6 GB",
