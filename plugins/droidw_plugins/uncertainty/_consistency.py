@@ -10,6 +10,7 @@ from torch import Tensor
 from droidw.errors import ConfigError
 from droidw.interfaces.uncertainty import StoreField, UncertaintyReport, UncertaintyView
 from droidw_plugins.uncertainty import _objective as objective
+from droidw_plugins.uncertainty._native import Kernels, load_kernels
 from droidw_plugins.uncertainty._options import ObjectiveOptions
 from droidw_plugins.uncertainty._published import Publisher
 
@@ -68,6 +69,9 @@ class Consistency:
         self._pairs: _Pairs | None = None
         self._taken: _Taken | None = None
         self._ordered = device.type == "cpu"
+        self._kernels: Kernels | None = None
+        if self._ordered and options.kernels == "auto":
+            self._kernels = load_kernels()
         fields: list[StoreField] = []
         if self._ordered:
             fields += [StoreField(_ROWS, ("h", "w", "c")), StoreField(_LENGTHS, ("h", "w"))]
@@ -121,9 +125,12 @@ class Consistency:
         options = self.options
         pairs = self._pairs_of(view)
         u = self.maps.learned(view)[pairs.first : pairs.last]
-        pair, energy = objective.pair_gradient(
-            u.flatten(1), pairs.rho, pairs.samples, options.decoupled
-        )
+        if self._kernels is not None and options.decoupled:
+            pair, energy = self._kernels.pair_gradient(u.flatten(1), pairs.rho, pairs.samples)
+        else:
+            pair, energy = objective.pair_gradient(
+                u.flatten(1), pairs.rho, pairs.samples, options.decoupled
+            )
         counts = pairs.counts if options.average else None
         full = objective.frame_gradient(
             pair.view(u.shape), u, counts, options.gamma_data, options.gamma_prior
@@ -154,9 +161,8 @@ class Consistency:
         touched = torch.cat([ii, jj, view.frames])
         first, last = int(touched.min()), int(touched.max()) + 1
         counts = torch.bincount(torch.cat([ii, jj]) - first, minlength=last - first)
-        xy, valid = objective.project(view.T_cw, view.disps, view.intrinsics, ii, jj)
         self.maps.weigh(view)
-        samples = objective.make_samples(xy, valid, view.disps.shape[2], ii - first, jj - first)
+        samples = self._samples(view, ii, jj, first)
         if options.tolerance > 0:
             cosine = self._renewed(view, samples, ii, jj, first, last)
         else:
@@ -173,11 +179,25 @@ class Consistency:
         )
         return self._pairs
 
+    def _samples(
+        self, view: UncertaintyView, ii: Tensor, jj: Tensor, first: int
+    ) -> objective.Samples:
+        poses, disps, intrinsics = view.T_cw, view.disps, view.intrinsics
+        if self._kernels is not None:
+            return self._kernels.samples(poses, disps, intrinsics, ii, jj, first)
+        xy, valid = objective.project(poses, disps, intrinsics, ii, jj)
+        return objective.make_samples(xy, valid, disps.shape[2], ii - first, jj - first)
+
     def _similarity(
         self, view: UncertaintyView, samples: objective.Samples, first: int, last: int
     ) -> Tensor:
-        lengths = view.fields[_LENGTHS][first:last].flatten(1) if self._ordered else None
-        return objective.similarity(self.rows(view, first, last), samples, lengths)
+        rows = self.rows(view, first, last)
+        if not self._ordered:
+            return objective.similarity(rows, samples)
+        lengths = view.fields[_LENGTHS][first:last].flatten(1)
+        if self._kernels is not None:
+            return self._kernels.similarity(rows, samples, lengths)
+        return objective.similarity(rows, samples, lengths)
 
     def _renewed(
         self,

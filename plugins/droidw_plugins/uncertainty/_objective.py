@@ -22,12 +22,15 @@ from droidw.geometry import se3
 from droidw.geometry.projective import NEAR, pixel_grid, relative_pose
 
 __all__ = [
+    "EPSILON",
     "Samples",
     "calibrated",
     "edges_used",
     "frame_gradient",
     "interpolate",
     "make_samples",
+    "motions",
+    "neighbours",
     "pair_energy",
     "pair_gradient",
     "project",
@@ -38,7 +41,8 @@ __all__ = [
     "softplus_slope",
 ]
 
-_EPSILON = 1e-6
+EPSILON = 1e-6
+"""Keeps the cosine of a feature that is zero, and the share of a frame without edges, finite."""
 # Feature values handled at a time on a CPU: the temporaries then stay in its cache.
 _CHUNK = 1 << 18
 
@@ -76,9 +80,32 @@ class Samples:
         )
 
 
+def neighbours(height: int, width: int) -> tuple[int, int, int, int]:
+    """`Samples.steps` of a grid; a grid of one row or column has no neighbours that way."""
+    right, below = (1 if width > 1 else 0), (width if height > 1 else 0)
+    return 0, right, below, below + right
+
+
 def edges_used(ii: Tensor, jj: Tensor, min_gap: int) -> Tensor:
     """Mask [E] of edges between frames at least `min_gap` keyframes apart."""
     return (ii - jj).abs() >= min_gap
+
+
+def motions(T_cw: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor) -> tuple[Tensor, Tensor]:
+    """Turn [E,3,3] and shift [E,3] that take cells of frame i to frame j.
+
+    `turn (x, y, 1) + shift d` is `(x' Z, y' Z, Z)`, with d the disparity of the cell and Z its
+    relative depth in frame j.
+
+    Args:
+        T_cw: [N,7]. intrinsics: [4] of the grid. ii, jj: [E].
+    """
+    fx, fy, cx, cy = intrinsics.to(T_cw.dtype).unbind()
+    o, one = torch.zeros_like(fx), torch.ones_like(fx)
+    K = torch.stack([fx, o, cx, o, fy, cy, o, o, one]).view(3, 3)
+    K_inv = torch.stack([1 / fx, o, -cx / fx, o, 1 / fy, -cy / fy, o, o, one]).view(3, 3)
+    G = relative_pose(T_cw, ii, jj)
+    return K @ se3.rotation(G) @ K_inv, G[:, :3] @ K.T
 
 
 def project(
@@ -92,13 +119,8 @@ def project(
         xy [E,2,P] in cells, and valid [E,P], not too near the camera.
     """
     h, w = disps.shape[1:]
-    fx, fy, cx, cy = intrinsics.to(T_cw.dtype).unbind()
-    o, one = torch.zeros_like(fx), torch.ones_like(fx)
-    K = torch.stack([fx, o, cx, o, fy, cy, o, o, one]).view(3, 3)
-    K_inv = torch.stack([1 / fx, o, -cx / fx, o, 1 / fy, -cy / fy, o, o, one]).view(3, 3)
-    G = relative_pose(T_cw, ii, jj)
-    turn = (K @ se3.rotation(G) @ K_inv).to(disps.dtype)
-    shift = (G[:, :3] @ K.T).to(disps.dtype)
+    turn, shift = motions(T_cw, intrinsics, ii, jj)
+    turn, shift = turn.to(disps.dtype), shift.to(disps.dtype)
     pixels = pixel_grid(h, w, disps.dtype, disps.device).view(-1, 2).T
     pixels = torch.cat([pixels, torch.ones_like(pixels[:1])])
     points = (turn.view(-1, 3) @ pixels).view(len(ii), 3, h * w)
@@ -128,14 +150,13 @@ def make_samples(xy: Tensor, valid: Tensor, width: int, ii: Tensor, jj: Tensor) 
     a, b = (place - corner).unbind(1)
     left, top = corner.unbind(1)
     first = torch.add(left, top, alpha=width).long().add_((jj * xy.shape[2])[:, None])
-    right, below = (1 if width > 1 else 0), (width if height > 1 else 0)
     weights = xy.new_empty(4, *a.shape)
     torch.mul(a, b, out=weights[3])
     torch.sub(b, weights[3], out=weights[2])
     torch.sub(a, weights[3], out=weights[1])
     torch.sub(1.0 - a, weights[2], out=weights[0])
     return Samples(
-        ii, place, first.flatten(), (0, right, below, below + right), weights.flatten(1), inside
+        ii, place, first.flatten(), neighbours(height, width), weights.flatten(1), inside
     )
 
 
@@ -193,7 +214,7 @@ def similarity(features: Tensor, samples: Samples, lengths: Tensor | None = None
         torch.mv(product[:count], ones, out=dot[rows])
         torch.mv(there.mul_(there), ones, out=square[rows])
     length = lengths.index_select(0, samples.source).flatten() * square.sqrt_()
-    return dot.div_(length.add_(_EPSILON)).view(n_edges, cells)
+    return dot.div_(length.add_(EPSILON)).view(n_edges, cells)
 
 
 def calibrated(cosine: Tensor, samples: Samples, bulk: float) -> Tensor:
@@ -207,7 +228,7 @@ def calibrated(cosine: Tensor, samples: Samples, bulk: float) -> Tensor:
     # Every third cell tells the median well enough, at a third of the sorting.
     some = torch.where(samples.inside, 1.0 - cosine, math.nan)[:, ::3]
     middle = some.nanmedian(dim=1, keepdim=True).values
-    scale = (bulk / middle.clamp_min(_EPSILON)).clamp_max_(1.0).nan_to_num_(1.0)
+    scale = (bulk / middle.clamp_min(EPSILON)).clamp_max_(1.0).nan_to_num_(1.0)
     return 1.0 - (1.0 - cosine) * scale
 
 
@@ -268,7 +289,7 @@ def frame_gradient(
     """
     if counts is None:
         return gamma_data * pair + gamma_prior / (u + 1.0)
-    share = gamma_data / (counts.to(u.dtype) + _EPSILON)
+    share = gamma_data / (counts.to(u.dtype) + EPSILON)
     return share[:, None, None] * pair + gamma_prior / (u + 1.0)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 __all__ = ["ObjectiveOptions"]
 
@@ -87,5 +88,12 @@ class ObjectiveOptions:
             "help": "cells by which the projection of an edge may have moved on average since its "
             "similarities were taken; beyond, they are renewed (0: always)",
             "ge": 0,
+        },
+    )
+    kernels: Literal["auto", "torch"] = field(
+        default="auto",
+        metadata={
+            "help": "auto: the costly parts compiled at first use, on a CPU with a C++ compiler; "
+            "torch: never"
         },
     )

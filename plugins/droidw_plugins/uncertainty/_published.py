@@ -103,7 +103,7 @@ class Publisher:
             options.residual_gain,
             options.smooth,
         )
-        starts = view.ii.unique()
+        starts = torch.bincount(view.ii - first).nonzero()[:, 0] + first
         view.fields[_FACTOR][starts] = factor[starts - first]
 
     def write(self, view: UncertaintyView, u: Tensor) -> None:
