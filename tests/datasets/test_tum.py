@@ -96,6 +96,9 @@ def test_by_name_and_its_short_form(reader, trees, data):
         assert source.camera.fx == 535.4 and source.name == "tum-freiburg3_walking_xyz"
     trees.rgbd(data / "TUM_RGBD" / "rgbd_dataset_freiburg1_desk", size=(640, 480), count=2)
     assert reader.open("tum:freiburg1_desk", Selection()).camera.fx == 517.3
+    trees.rgbd(data / "walk", size=(640, 480), count=2)
+    (data / "TUM_RGBD" / "rgbd_dataset_freiburg2_xyz").symlink_to(data / "walk")
+    assert reader.open("tum:freiburg2_xyz", Selection()).camera.fx == 520.9
     with pytest.raises(InputError, match="has no sequence 'f3/w'"):
         reader.open("tum:f3/w", Selection())
 

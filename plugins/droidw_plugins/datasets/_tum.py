@@ -46,7 +46,9 @@ class TumReader:
         """Open the sequence; see `DatasetReader.open`."""
         place = self._datasets.locate(source, "tum", EXPECTED)
         out = open_rgbd(place, selection, self._max_difference, published=self._datasets.published)
-        out.camera = _published_camera(place.folder.resolve().name, out.size, out.problems)
+        # a link may point to a folder of any name; what was asked for by name is known
+        name = place.row.name if place.row is not None else place.folder.resolve().name
+        out.camera = _published_camera(name, out.size, out.problems)
         return out
 
 
