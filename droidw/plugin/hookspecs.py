@@ -79,15 +79,21 @@ def droidw_depth_priors() -> Iterable[Component[DepthPrior]]:
 
         import droidw
 
+        WEIGHTS = droidw.WeightsFile(
+            name="acme-depth", urls=("https://acme.example/depth.pth",), size=90_000_000,
+            licence="CC BY-NC 4.0", check="droidw_acme.depth:check",
+        )
+
         def build(options, context):
+            from droidw.io.weights import load_state
             from droidw_acme.depth import AcmeDepth
-            return AcmeDepth(context.weights_dir / "acme.pth", context.device)
+            return AcmeDepth(load_state(context.weights_dir, WEIGHTS), context.device)
 
         @droidw.hookimpl
         def droidw_depth_priors():
             yield droidw.Component(
                 name="acme-depth", summary="metric depth of the Acme network", factory=build,
-                requires=("acme_net",), extra="net", weights=("acme.pth",),
+                requires=("acme_net",), extra="net", weights=(WEIGHTS,),
                 capabilities=frozenset({"cpu", "cuda", "depth"}),
                 reference="Acme 2025; code MIT, weights CC-BY-NC-4.0",
             )
@@ -163,13 +169,13 @@ def droidw_correspondence_ops() -> Iterable[Component[Correspondence]]:
 
         def build(options, context):
             from droidw_acme.matcher import AcmeMatcher
-            return AcmeMatcher(context.weights_dir / "matcher.pth", context.device)
+            return AcmeMatcher(options, context.device)
 
         @droidw.hookimpl
         def droidw_correspondence_ops():
             yield droidw.Component(
                 name="acme", summary="dense matches of the Acme network", factory=build,
-                weights=("matcher.pth",), capabilities=frozenset({"cpu", "cuda"}),
+                capabilities=frozenset({"cpu", "cuda"}),
             )
     """
     raise NotImplementedError
