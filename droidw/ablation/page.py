@@ -28,8 +28,9 @@ def make_page(table: Table, command: str = "") -> str:
     plan = table.plan
     done = sum(outcome is not None and not outcome.error for _, outcome in table.cells)
     parts = [
-        f"<h1>{escape(plan.title)}</h1><p>{len(plan.rows)} rows, {len(plan.sequences)} sequences, "
-        f"{len(plan.seeds)} seeds: {done} of {len(table.cells)} cells have a result.</p>"
+        f"<h1>{escape(plan.title)}</h1><p>Rows: {len(plan.rows)}, sequences: "
+        f"{len(plan.sequences)}, seeds: {len(plan.seeds)}. {done} of {len(table.cells)} cells have "
+        "a result.</p>"
     ]
     if command:
         parts.append(f"<pre>{escape(command)}</pre>")
