@@ -83,9 +83,10 @@ class Consistency(ctypes.Structure):
 
     _fields_: ClassVar = [
         *((name, c_int64) for name in ("frames", "edges", "cells", "chunk", "chunks")),
-        *((name, c_void_p) for name in ("u", "rho", "weights", "corners")),
+        *((name, c_void_p) for name in ("u", "rho", "weights", "first")),
+        ("steps", c_int64 * 4),
         *((name, c_void_p) for name in ("source_start", "source_edges", "source")),
-        *((name, c_void_p) for name in ("here", "there", "part", "exponent", "sums", "gradient")),
+        *((name, c_void_p) for name in ("here", "there", "part", "scale", "sums", "gradient")),
     ]
 
 

@@ -23,7 +23,7 @@ from droidw_plugins.bundle._build import (
     first_found,
 )
 
-__all__ = ["NativeKernels", "native_recipe"]
+__all__ = ["NativeKernels", "load_native", "native_recipe"]
 
 _VERSION = 1
 _STATUS = ("ok", "rejected", "singular", "nonfinite", "empty")
@@ -89,6 +89,33 @@ def _processor() -> str:
     return " ".join(sorted({line for line in lines if line.startswith(wanted)}))
 
 
+def load_native() -> ctypes.CDLL:
+    """The library, compiled now if it is not in the cache.
+
+    Raises:
+        BuildError: there is no compiler, it failed, or the library cannot be loaded.
+    """
+    recipe = native_recipe()
+    if recipe is None:
+        raise BuildError(
+            f"no C++ compiler was found (looked for $CXX, {', '.join(_COMPILERS)}); install "
+            "g++ or clang, or use ba=torch"
+        )
+    path = build(recipe)
+    try:
+        library = ctypes.CDLL(str(path))
+        library.dw_native_open.restype = c_void_p
+        library.dw_native_close.argtypes = [c_void_p]
+        library.dw_native_close.restype = None
+        library.dw_native_step.argtypes = [c_void_p, POINTER(_Problem), c_int32, POINTER(_Report)]
+        version = int(library.dw_native_version())
+    except (OSError, AttributeError) as error:
+        raise BuildError(f"{path} cannot be loaded ({error}); delete it to try again") from error
+    if version != _VERSION:
+        raise BuildError(f"{path} is of version {version}, not {_VERSION}; delete it")
+    return library
+
+
 class NativeKernels:
     """The loaded library, with scratch memory of its own.
 
@@ -97,28 +124,7 @@ class NativeKernels:
     """
 
     def __init__(self) -> None:
-        recipe = native_recipe()
-        if recipe is None:
-            raise BuildError(
-                f"no C++ compiler was found (looked for $CXX, {', '.join(_COMPILERS)}); install "
-                "g++ or clang, or use ba=torch"
-            )
-        path = build(recipe)
-        try:
-            library = ctypes.CDLL(str(path))
-            library.dw_native_open.restype = c_void_p
-            library.dw_native_close.argtypes = [c_void_p]
-            library.dw_native_close.restype = None
-            library.dw_native_step.argtypes = [
-                c_void_p, POINTER(_Problem), c_int32, POINTER(_Report)
-            ]  # fmt: skip
-            version = int(library.dw_native_version())
-        except (OSError, AttributeError) as error:
-            raise BuildError(
-                f"{path} cannot be loaded ({error}); delete it to try again"
-            ) from error
-        if version != _VERSION:
-            raise BuildError(f"{path} is of version {version}, not {_VERSION}; delete it")
+        library = load_native()
         self._library = library
         self._handle = library.dw_native_open()
         if not self._handle:

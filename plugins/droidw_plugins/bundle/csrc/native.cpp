@@ -9,25 +9,10 @@
 #include "native_problem.h"
 #include "native_solve.h"
 #include "native_unit.h"
-
-#if defined(_OPENMP)
-#include <omp.h>
-#endif
+#include "native_views.h"
+#include "parallel.h"
 
 namespace dw {
-
-// Runs f(index, thread) for every index below n.
-template <class F>
-void parallel(int64_t n, int threads, F f) {
-#if defined(_OPENMP)
-    if (threads > 1 && n > 1) {
-#pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
-        for (int64_t k = 0; k < n; ++k) f(k, omp_get_thread_num());
-        return;
-    }
-#endif
-    for (int64_t k = 0; k < n; ++k) f(k, 0);
-}
 
 template <class S>
 class Stepper {
@@ -336,6 +321,20 @@ int32_t dw_native_step(void* handle, const dw::Problem* p, int32_t size, dw::Rep
     } catch (const std::bad_alloc&) {
         return 1;
     }
+}
+
+// Maps and distances; size as above.
+void dw_native_similarity(const dw::SampleJob* job, int32_t size) {
+    if (size == 8) dw::similarity<double>(*job);
+    else dw::similarity<float>(*job);
+}
+void dw_native_data_term(const dw::SampleJob* job, int32_t size) {
+    if (size == 8) dw::data_term<double>(*job);
+    else dw::data_term<float>(*job);
+}
+void dw_native_flow(const dw::FlowJob* job, int32_t size) {
+    if (size == 8) dw::flow_sums<double>(*job);
+    else dw::flow_sums<float>(*job);
 }
 
 }  // extern "C"

@@ -100,13 +100,14 @@ struct ConfirmedViews {
 // of K frames, with the samples of droidw_plugins.uncertainty._objective.
 struct Consistency {
     int64_t frames, edges, cells, chunk, chunks;
-    const void *u, *rho, *weights;      // [K,P], [E,P], [E*P,4]
-    const int32_t* corners;             // [E*P,4] rows of a table [K*P]
+    const void *u, *rho, *weights;      // [K,P], [E,P], [4,E*P]
+    const int64_t* first;               // [E*P] upper left neighbour, row of a table [K*P]
+    int64_t steps[4];                   // from there to the four neighbours
     const int64_t *source_start, *source_edges;  // edges by source frame
     const int64_t* source;              // [E]
     void *here, *there;                 // [E,P] derivative with respect to u_i, and to u_ij
     double* part;                       // [E * chunks] energy
-    const double* exponent;             // [1] power of two by which a spread value is scaled
+    const double* scale;                // [1] power of two by which a spread value is multiplied
     int64_t* sums;                      // [K,P] fixed point
     void* gradient;                     // [K,P]
 };
@@ -124,7 +125,8 @@ struct PairValues {
         const int64_t at = e * job.cells + cell;
         const S *u = static_cast<const S*>(job.u), *weights = static_cast<const S*>(job.weights);
         S there = 0;
-        for (int k = 0; k < 4; ++k) there += u[job.corners[4 * at + k]] * weights[4 * at + k];
+        for (int k = 0; k < 4; ++k)
+            there += u[job.first[at] + job.steps[k]] * weights[k * job.edges * job.cells + at];
         const S here = u[job.source[e] * job.cells + cell];
         const S energy = static_cast<const S*>(job.rho)[at] / (here * there);
         static_cast<S*>(job.here)[at] = -energy / here;
@@ -142,8 +144,9 @@ struct SpreadValues {
         const double value = double(static_cast<const S*>(job.there)[at]);
         const S* weights = static_cast<const S*>(job.weights);
         for (int k = 0; k < 4; ++k) {
-            const double share = ldexp(value * double(weights[4 * at + k]), int(*job.exponent));
-            if (share != 0) add_integer(job.sums + job.corners[4 * at + k], llrint(share));
+            const double weight = double(weights[k * job.edges * job.cells + at]);
+            const int64_t share = int64_t(llrint(value * weight * *job.scale));
+            if (share != 0) add_integer(job.sums + job.first[at] + job.steps[k], share);
         }
     }
 };
@@ -153,7 +156,7 @@ struct GatherGradient {
     Consistency job;
     DW_KERNEL void operator()(int64_t at) const {
         const int64_t frame = at / job.cells, cell = at % job.cells;
-        double sum = ldexp(double(job.sums[at]), -int(*job.exponent));
+        double sum = double(job.sums[at]) / *job.scale;
         for (int64_t q = job.source_start[frame]; q < job.source_start[frame + 1]; ++q)
             sum += double(static_cast<const S*>(job.here)[job.source_edges[q] * job.cells + cell]);
         static_cast<S*>(job.gradient)[at] = S(sum);
