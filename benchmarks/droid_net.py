@@ -21,7 +21,7 @@ import statistics
 import tempfile
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -129,7 +129,7 @@ def clock(
 
 def time_parts(
     part: DroidCorrespondence, height: int, width: int, counts: list[int], repeats: int
-) -> list[dict[str, Any]]:
+) -> Iterator[dict[str, Any]]:
     """Rows of the table of times for pictures of one size."""
     device, net = part.device, part.net
     image = torch.rand(1, 3, height, width, device=device)
@@ -142,10 +142,9 @@ def time_parts(
 
         return inside
 
-    rows = []
     for name, call in (("fnet", net.features), ("cnet", net.context)):
         [(median, least)] = clock(device, repeats, run(lambda c=call: c(image)))
-        rows.append({"what": name, "ms": median, "least": least})
+        yield {"what": name, "ms": median, "least": least}
     payloads = made_up(part, max(SOURCES.values()) + 1, height, width)
     part._latest = payloads[0]
     both = clock(
@@ -153,8 +152,8 @@ def time_parts(
         lambda: part.motion(payloads[0], payloads[1]),
         run(lambda: published_motion(part, payloads[0], payloads[1], grid)),
     )  # fmt: skip
-    rows.append({"what": "motion filter", "ms": both[0][0], "least": both[0][1],
-                 "published order": both[1][1]})  # fmt: skip
+    yield {"what": "motion filter", "ms": both[0][0], "least": both[0][1],
+                 "published order": both[1][1]}  # fmt: skip
     for count in counts:
         sources = SOURCES.get(count, max(1, count // 4))
         ii = sorted(k % sources for k in range(count))
@@ -171,11 +170,10 @@ def time_parts(
             edges = session._state(request, range(count), coords)
             call = run(partial(session._correlation, request, range(count), coords, edges))
             [(median, least)] = clock(device, repeats, call)
-            rows.append({"what": f"correlation {mode}", "edges": count, "ms": median,
-                         "least": least})  # fmt: skip
+            yield {"what": f"correlation {mode}", "edges": count, "ms": median,
+                         "least": least}  # fmt: skip
             del session, edges
-        rows.append(time_update(part, payloads, ii, repeats))
-    return rows
+        yield time_update(part, payloads, ii, repeats)
 
 
 def time_update(
