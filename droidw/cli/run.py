@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--preset",
         default=None,
-        help="cpu, paper, or auto: paper where its parts and weights are there, else cpu "
-        "(default: auto, or what --config says)",
+        help="cpu, paper, droid-slam, or auto: paper where its parts and weights are there, else "
+        "cpu (default: auto, or what --config says)",
     )
     parser.add_argument("--calib", metavar="FILE", help="calibration of the raw pictures")
     parser.add_argument("--focal", metavar="PX", help="focal length in pixels of the raw pictures")
