@@ -79,7 +79,19 @@ def host_backend(**options):
         pytest.skip(f"the kernels cannot be compiled here: {error}")
 
 
+def cuda_backend(**options):
+    from droidw_plugins.bundle.cuda_ba import CudaBundleAdjuster, CudaBundleOptions
+
+    return CudaBundleAdjuster(CudaBundleOptions(**options))
+
+
 BACKENDS = {"torch": torch_backend, "native": native_backend, "host": host_backend}
+
+
+@pytest.fixture
+def backends():
+    """Name -> what makes an adjuster, on a GPU too."""
+    return {**BACKENDS, "cuda": cuda_backend}
 
 
 @pytest.fixture(params=BACKENDS)

@@ -1,0 +1,148 @@
+"""The GPU kernels as far as they go without a GPU: order of work, tiles, building."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from droidw.errors import MissingRequirementError
+from droidw.plugin.component import BuildContext
+from droidw_plugins.bundle import _kernel_calls, cuda_ba
+from droidw_plugins.bundle._build import BuildError
+from droidw_plugins.bundle._kernel_layout import TILE, make_kernel_layout
+from droidw_plugins.bundle._kernel_solve import solve_dense, solve_tiled
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def edges(pairs):
+    return torch.tensor(pairs, dtype=torch.int64).T.contiguous()
+
+
+def test_other_edges_in_the_same_number_are_noticed(make, backends):
+    p, _, _ = make(noise=0.02)
+    turned = torch.randperm(len(p.ii), generator=torch.Generator().manual_seed(3))
+    q = replace(
+        p, ii=p.ii[turned], jj=p.jj[turned], target=p.target[turned], weight=p.weight[turned]
+    )
+    adjuster = backends["host"]()
+    adjuster.step(p)
+    got = adjuster.step(q)
+    expected = backends["host"]().step(q)
+    assert torch.equal(got.T_cw, expected.T_cw)
+    assert torch.equal(got.disps, expected.disps)
+
+
+def test_an_edge_to_nowhere_is_refused(make, backends):
+    p, _, _ = make()
+    with pytest.raises(ValueError, match="jj"):
+        backends["host"]().step(replace(p, jj=torch.full_like(p.jj, 9)))
+
+
+@pytest.mark.parametrize("motion_only", [False, True])
+def test_tiles_give_the_step_of_the_dense_system(make, backends, motion_only):
+    # 70 poses: three tiles a side, the last one in part; a loop joins the ends
+    p, _, _ = make(n=70, h=3, w=4, reach=2, noise=0.005, ep=1e-2, motion_only=motion_only)
+    ii, jj = torch.cat((p.ii, torch.tensor([0, 69]))), torch.cat((p.jj, torch.tensor([69, 0])))
+    p = replace(
+        p, ii=ii, jj=jj, target=torch.cat((p.target, p.target[:2])),
+        weight=torch.cat((p.weight, 1e-3 * p.weight[:2])), damping=torch.full_like(p.disps, 1e-3),
+    )  # fmt: skip
+    dense, tiled = backends["host"](), backends["host"](tiled_from=1)
+    expected, got = dense.step(p), tiled.step(p)
+    assert expected.report.status == got.report.status == "ok"
+    torch.testing.assert_close(got.T_cw, expected.T_cw, atol=1e-10, rtol=0)
+    torch.testing.assert_close(got.disps, expected.disps, atol=1e-9, rtol=0)
+
+
+def test_only_tiles_that_fill_are_kept():
+    n = 10 * TILE // 6
+    chain = [(k, k + 1) for k in range(n - 1)]
+    plan = make_kernel_layout(*edges(chain), n, tiled_from=1).tiles
+    assert plan.count == 10
+    assert len(plan.index) == 10 + 9
+    closed = make_kernel_layout(*edges([*chain, (0, n - 1)]), n, tiled_from=1).tiles
+    # the loop's row fills from the first column on, and nothing else does
+    assert len(closed.index) == 10 + 9 + 8
+
+
+def test_a_singular_system_is_said_by_both_solvers():
+    n = 2 * TILE // 6
+    plan = make_kernel_layout(*edges([(k, k + 1) for k in range(n - 1)]), n, tiled_from=1).tiles
+    g = torch.ones(6 * n, dtype=torch.float64)
+    for pivot, good in ((1.0, True), (1e-9, False), (-1.0, False)):
+        S = 2 * torch.eye(6 * n, dtype=torch.float64)
+        S[5, 5] = pivot
+        least = torch.full((6 * n,), 1e-6, dtype=torch.float64)
+        x, solved = solve_dense(S, g, least)
+        assert bool(solved) is good
+        tiles = torch.zeros(len(plan.index), TILE, TILE, dtype=torch.float64)
+        for k in range(plan.count):
+            tiles[plan.index[k, k]] = S[k * TILE : (k + 1) * TILE, k * TILE : (k + 1) * TILE]
+        y, solved = solve_tiled(tiles, plan, g, least)
+        assert bool(solved) is good
+        if good:
+            torch.testing.assert_close(y, x)
+
+
+def test_without_a_gpu_the_backend_says_so():
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    assert cuda_ba.COMPONENT.available() == "no GPU visible"
+    with pytest.raises(MissingRequirementError, match="no GPU"):
+        cuda_ba.COMPONENT.factory(
+            cuda_ba.CudaBundleOptions(), BuildContext(device=torch.device("cuda"))
+        )
+
+
+def test_a_library_of_another_kind_is_refused(tmp_path):
+    wrong = tmp_path / "wrong.so"
+    wrong.write_bytes(b"no library at all")
+    with pytest.raises(BuildError, match="cannot be loaded"):
+        _kernel_calls.KernelLibrary(wrong)
+
+
+def needs_nvcc():
+    if not _kernel_calls.nvcc_path():
+        pytest.skip("no nvcc here")
+
+
+def test_machine_code_is_made_for_the_gpu_and_ptx_is_kept():
+    needs_nvcc()
+    known = _kernel_calls.known_architectures(_kernel_calls.nvcc_path())
+    assert known and min(known) >= 75 and max(known) <= 121
+    assert "code=[sm_90,compute_90]" in _kernel_calls.cuda_flags(90)[-1]
+
+
+def cuda_check(tmp_path, architectures):
+    library = tmp_path / "cuda.so"
+    done = subprocess.run(
+        ["make", "--no-print-directory", "cuda-check", f"ARGS={library}"],
+        cwd=ROOT, env={**os.environ, "ARCHITECTURES": architectures},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout, library
+
+
+def test_the_cuda_kernels_compile_and_offer_what_is_called(tmp_path):
+    needs_nvcc()
+    said, library = cuda_check(tmp_path, "75")
+    assert "sm_75" in said
+    loaded = _kernel_calls.KernelLibrary(library)  # needs no GPU
+    names = "system substitute move energy prior_energy frame_distance confirmed_views"
+    for name in [*names.split(), "pair_values", "pair_gradient", "parameter_gradient"]:
+        assert hasattr(loaded._library, f"dw_{name}")
+
+
+@pytest.mark.slow
+def test_the_cuda_kernels_compile_for_every_architecture(tmp_path):
+    needs_nvcc()
+    said, _ = cuda_check(tmp_path, "")
+    for architecture in _kernel_calls.known_architectures(_kernel_calls.nvcc_path()):
+        assert f"sm_{architecture}" in said
