@@ -6,8 +6,11 @@ import importlib.util
 import logging
 import os
 import shutil
+import signal
 import tempfile
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -70,25 +73,42 @@ def run_on_ray(
     each = [cpus if cpus is not None else float(cell.threads) for cell, _ in cells]
     place = None if address else tempfile.mkdtemp(prefix="droidw-ray-")
     try:
-        try:
-            if address:
-                ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
-            else:
-                room = max(1, round(jobs * max(each, default=1.0)))
-                ray.init(
-                    num_cpus=room, include_dashboard=False, log_to_driver=False,
-                    logging_level=logging.ERROR, _temp_dir=place,
-                )  # fmt: skip
-        except Exception as error:
-            raise DroidwError(
-                f"--executor ray: Ray cannot be started or reached: {error}",
-                "check --ray-address, or run the cells as processes: --executor local",
-            ) from error
+        room = max(1, round(jobs * max(each, default=1.0)))
+        with _own_signals():
+            _start(ray.init, address, room, place)
         _run(cells, each, tell, limit, stopped)
     finally:
         ray.shutdown()
         if place:
             shutil.rmtree(place, ignore_errors=True)
+
+
+def _start(init: Callable[..., Any], address: str | None, room: int, place: str | None) -> None:
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+    try:
+        if address:
+            init(address=address, **quiet)
+        else:
+            init(num_cpus=room, include_dashboard=False, _temp_dir=place, **quiet)
+    except Exception as error:
+        raise DroidwError(
+            f"--executor ray: Ray cannot be started or reached: {error}",
+            "check --ray-address, or run the cells as processes: --executor local",
+        ) from error
+
+
+@contextmanager
+def _own_signals() -> Iterator[None]:
+    """Ray sets a handler for SIGTERM when it starts; ours, which lose nothing, stay."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _run(

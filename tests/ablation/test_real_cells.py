@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from types import SimpleNamespace
 
 import pytest
@@ -136,8 +137,11 @@ def figures(table):
 
 def test_ray_makes_the_same_table_though_a_worker_is_killed(local, files):
     marker = files / "killed"
+    handler = signal.getsignal(signal.SIGTERM)
     table = run(files, "ray", f"observers.killer={{path: {marker}}}", executor="ray", jobs=2)
     assert marker.exists()
+    # Ray would take SIGTERM for itself, and finished cells would have no table.
+    assert signal.getsignal(signal.SIGTERM) == handler
     assert figures(table) == figures(local) != {}
     assert [why for _, why in table.failures()] == [why for _, why in local.failures()]
     # And goes on as well: with local processes, nothing that is finished runs again.
