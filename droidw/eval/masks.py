@@ -158,6 +158,12 @@ def score_folder(uncertainty: Path, masks: Path, after: int = 0) -> MaskScore:
     known = find_masks(masks)
     notes: list[str] = []
     pairs = [(maps[index], known[index]) for index in sorted(maps) if index in known]
+    if max(maps) >= len(known) == max(known) + 1 and not _frame_names(masks.parent):
+        raise InputError(
+            f"{masks}: its {len(known)} masks cannot be laid on the pictures: the uncertainty maps "
+            f"go up to picture {max(maps)}, counted from 0",
+            "give one mask per picture, in the order of the pictures",
+        )
     if not pairs:
         raise InputError(
             f"{masks}: no mask belongs to any of the {len(maps)} uncertainty maps in {uncertainty}"
@@ -188,10 +194,11 @@ def find_masks(folder: Path) -> dict[int, Path]:
     """Masks by the index of their frame.
 
     Frames are those of `rgb.txt` beside the folder, or else of `rgb/` beside it, in order, and a
-    mask has the name of its frame; without either, the masks themselves are counted from 0.
+    mask has the name of its frame; without such names, masks are counted from 0.
 
     Raises:
-        InputError: if the folder is missing or holds no pictures.
+        InputError: if the folder is missing or holds no pictures, or if names and count of the
+            masks are both other than those of the pictures.
     """
     files = _pictures(folder)
     if not files:
@@ -199,6 +206,12 @@ def find_masks(folder: Path) -> dict[int, Path]:
     by_stem = {path.stem: path for path in files}
     frames = _frame_names(folder.parent)
     named = {index: by_stem[name] for index, name in enumerate(frames) if name in by_stem}
+    if not named and frames and len(frames) != len(files):
+        raise InputError(
+            f"{folder}: its {len(files)} masks cannot be laid on {len(frames)} pictures: none has "
+            "the name of a picture, and the count is another",
+            "name each mask like its picture, or give one mask per picture",
+        )
     return named or dict(enumerate(files))
 
 

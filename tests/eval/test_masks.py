@@ -136,6 +136,22 @@ def test_masks_alone_are_counted(tmp_path: Path) -> None:
     assert [find_masks(root / "mask")[i].name for i in (0, 1)] == ["a.png", "b.png"]
 
 
+def test_another_count_is_refused(tmp_path: Path) -> None:
+    root = folder(tmp_path, ["a", "b", "c"], listed=True)
+    for number, path in enumerate(sorted((root / "mask").iterdir())):
+        path.rename(root / "mask" / f"m{number}.png")
+    assert score_folder(root / "uncertainty", root / "mask").frames == 3  # by order
+    (root / "mask" / "m1.png").unlink()
+    with pytest.raises(InputError, match="its 2 masks cannot be laid on 3 pictures"):
+        score_folder(root / "uncertainty", root / "mask")
+    # Nothing says how many pictures there are, but the maps tell that there were more.
+    (root / "rgb.txt").unlink()
+    for path in (root / "rgb").iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match="the uncertainty maps go up to picture 2"):
+        score_folder(root / "uncertainty", root / "mask")
+
+
 def test_another_shape_is_told(tmp_path: Path) -> None:
     root = folder(tmp_path, ["a", "b"], listed=True)
     for path in (root / "uncertainty").iterdir():
