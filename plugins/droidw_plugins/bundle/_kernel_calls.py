@@ -250,8 +250,10 @@ class KernelLibrary:
             code = launcher(ctypes.byref(job), *more, size, None)
         else:
             with torch.cuda.device(device):
+                index = torch.cuda.current_device()
                 stream = torch.cuda.current_stream(device).cuda_stream
-                code = launcher(ctypes.byref(job), *more, size, c_void_p(stream))
+                code = self._library.dw_use_device(c_int32(index))
+                code = code or launcher(ctypes.byref(job), *more, size, c_void_p(stream))
         if code:
             said = self._library.dw_error_text(c_int32(code)).decode()
             raise RuntimeError(f"the CUDA kernels of '{name}' failed: {said} (error {code})")

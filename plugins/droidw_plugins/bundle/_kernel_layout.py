@@ -170,7 +170,7 @@ def _on_device(named: dict[str, Ints], device: torch.device) -> dict[str, Tensor
     flat = np.concatenate([np.asarray(a, dtype=np.int64) for a in named.values()])
     whole = torch.from_numpy(flat).to(device)
     sizes = [a.size for a in named.values()]
-    return dict(zip(named, whole.split(sizes), strict=True))
+    return dict(zip(named, torch.split(whole, sizes), strict=True))
 
 
 def _pairs(start: Ints, active: Ints) -> tuple[Ints, Ints, Ints]:

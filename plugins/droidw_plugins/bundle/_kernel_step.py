@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -270,7 +271,7 @@ def _ready(problem: BAProblem) -> BAProblem:
         "T_cw": (n, 7), "disps": (n, h, w), "intrinsics": (4,), "target": (edges, h, w, 2),
         "weight": (edges, h, w, 2), "damping": (n, h, w), "prior": (n, h, w),
     }  # fmt: skip
-    ready: dict[str, Tensor] = {}
+    ready: dict[str, Any] = {}
     for name, shape in shapes.items():
         value = getattr(problem, name)
         if value is None:
