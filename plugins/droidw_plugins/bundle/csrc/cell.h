@@ -81,7 +81,7 @@ template <class R>
 DW_HD R drop_nonfinite(R& tu, R& tv, R& wu, R& wv) {
     using S = element<R>;
     const R zero = fill<R>(S(0)), one = fill<R>(S(1));
-    const auto usable = finite_number(wu * (tu * tu)) & finite_number(wv * (tv * tv));
+    const auto usable = both(finite_number(wu * (tu * tu)), finite_number(wv * (tv * tv)));
     tu = select(usable, tu, zero);
     tv = select(usable, tv, zero);
     wu = select(usable, wu, zero);

@@ -77,6 +77,11 @@ DW_HD Pack<S> select(Mask<S> mask, Pack<S> a, Pack<S> b) {
 }
 
 template <class S>
+DW_HD Mask<S> both(Mask<S> a, Mask<S> b) {
+    return a & b;
+}
+
+template <class S>
 struct Element<Pack<S>> {
     using type = S;
 };

@@ -32,6 +32,7 @@ DW_HD R fill(element<R> s) {
 
 DW_HD float select(bool mask, float a, float b) { return mask ? a : b; }
 DW_HD double select(bool mask, double a, double b) { return mask ? a : b; }
+DW_HD bool both(bool a, bool b) { return a && b; }
 DW_HD float root(float x) { return sqrtf(x); }
 DW_HD double root(double x) { return sqrt(x); }
 
