@@ -173,15 +173,15 @@ class UpdateOperator(nn.Module):
         if motion is None:
             motion = corr.new_zeros(corr.shape[0], 4, *corr.shape[2:])
         fused = self.fused
-        of_source = F.conv2d(inp, fused.zrq_inp, padding=1)
-        if which is not None:
-            of_source = of_source[which]
-        add = of_source + self._everywhere(net)
-        rest = torch.cat([self.corr_encoder(corr), self.flow_encoder(motion)], dim=1)
-        zr = F.conv2d(torch.cat([net, rest], 1), fused.zr, padding=1)
-        z, r = torch.sigmoid(zr + add[:, :256]).chunk(2, dim=1)
-        q = F.conv2d(torch.cat([r * net, rest], 1), fused.q, padding=1)
-        net = torch.lerp(net, torch.tanh(q + add[:, 256:]).to(net.dtype), z.to(net.dtype))
+        add = F.conv2d(inp, fused.zrq_inp, padding=1)
+        add = add.clone() if which is None else add[which]
+        add += self._everywhere(net)
+        # One buffer for both convolutions, and sums in place: large temporaries are dear.
+        x = torch.cat([net, self.corr_encoder(corr), self.flow_encoder(motion)], dim=1)
+        zr = F.conv2d(x, fused.zr, padding=1).add_(add[:, :256]).sigmoid_()
+        x[:, :128] *= zr[:, 128:]
+        q = F.conv2d(x, fused.q, padding=1).add_(add[:, 256:]).tanh_()
+        net = torch.lerp(net, q.to(net.dtype), zr[:, :128].to(net.dtype))
         return self._heads(net, aggregate)
 
     def still(self, net: Tensor, inp: Tensor) -> Still:
