@@ -59,7 +59,8 @@ class Job(ctypes.Structure):
             (c_void_p, "block_row block_col block_at part_start part"),
             (c_void_p, "motions adjoints edge_part edge_sums pair_part pair_sums turned own"),
             (c_void_p, "system g least dx rounded E curvature gradient Q rhs steps"),
-            (c_void_p, "free flags energy_part T_out disps_out"),
+            (c_void_p, "free flags energy_part T_out disps_out told"),
+            (c_void_p, "given_ii given_jj held_ii held_jj factor info"),
         )
         for name in names.split()
     ]

@@ -13,15 +13,20 @@ from droidw_plugins.bundle._kernel_layout import TILE, TilePlan
 __all__ = ["solve_dense", "solve_tiled"]
 
 
-def solve_dense(S: Tensor, g: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
-    """Solution [n] of the lower triangle S [n,n], and whether every pivot exceeds `least` [n]."""
+def solve_dense(S: Tensor, g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Solution [n] of the lower triangle S [n,n], its factor, and the status of the factorisation.
+
+    The pivots are for the caller to judge.
+    """
     L, info = torch.linalg.cholesky_ex(S)
-    good = (info == 0) & (L.diagonal().square() > least).all()
-    return torch.cholesky_solve(g[:, None], L)[:, 0], good
+    return torch.cholesky_solve(g[:, None], L)[:, 0], L, info
 
 
 def solve_tiled(tiles: Tensor, plan: TilePlan, g: Tensor, least: Tensor) -> tuple[Tensor, Tensor]:
     """The same for tiles [T,TILE,TILE] of the lower triangle, which are overwritten.
+
+    Returns:
+        The solution [n], and whether every pivot exceeds `least`.
 
     The cost follows the tiles that are not 0: for a band it grows with its length.
 

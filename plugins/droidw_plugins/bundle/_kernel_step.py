@@ -13,16 +13,16 @@ from droidw.solve.problem import BAProblem, Report, Step
 from droidw_plugins.bundle._kernel_calls import Job, KernelLibrary
 from droidw_plugins.bundle._kernel_layout import TILED_FROM, KernelLayout, make_kernel_layout
 from droidw_plugins.bundle._kernel_solve import solve_dense, solve_tiled
-from droidw_plugins.bundle._layout import Workspace
 
 __all__ = ["CHUNK", "KernelStepper", "chunks_of"]
 
 CHUNK = 1024
 """Cells whose sums one block of threads makes."""
 
-_EDGE_SUMS, _PAIR_SUMS, _ENERGY = 29, 42, 27
-_BAD_SUMS, _CURVED, _PRIOR, _BAD_STEP = range(4)
+_EDGE_SUMS, _PAIR_SUMS, _FLAGS = 29, 42, 6
+_BAD_SUMS, _CURVED, _PRIOR, _BAD_STEP, _OTHER_EDGES, _SINGULAR = range(_FLAGS)
 _FLOOR = {torch.float32: 1e-5, torch.float64: 1e-11}
+_GIVEN = ("T_cw", "disps", "intrinsics", "target", "weight", "damping", "fixed")
 
 
 def chunks_of(cells: int) -> int:
@@ -34,14 +34,62 @@ def chunks_of(cells: int) -> int:
 class _Found:
     """What is read back from the device, once per step."""
 
-    same: bool
     flags: tuple[bool, ...]
-    solved: bool
     energy: float
     dropped: int
     prior: float
-    norm: float
     free: tuple[int, ...]
+    norm: float
+
+
+class _Scratch:
+    """Memory of a step, and the job that points to it: made once for edges, grid and type.
+
+    Holds no state that could change a result: everything is written before it is read.
+    """
+
+    def __init__(self, problem: BAProblem, layout: KernelLayout) -> None:
+        n, h, w = problem.disps.shape
+        e, cells, like = problem.ii.shape[0], h * w, problem.disps
+        chunks = chunks_of(cells)
+        depth = 0 if problem.motion_only else 1
+        self.layout, self.key = layout, _key(problem)
+
+        def full(*shape: int) -> Tensor:
+            return torch.empty(*shape, dtype=torch.float64, device=like.device)
+
+        def plain(*shape: int) -> Tensor:
+            return like.new_empty(*shape)
+
+        self.system, self.g, self.least = full(layout.system_size), full(6 * n), full(6 * n)
+        self.told, self.moved = full(_FLAGS + 3 + 2 * n), plain(e, 12)
+        self.flags = torch.zeros(_FLAGS, dtype=torch.int32, device=like.device)
+        self.held: dict[str, Tensor] = {
+            **layout.arrays, "held_ii": layout.ii, "held_jj": layout.jj,
+            "system": self.system, "g": self.g, "least": self.least,
+            "told": self.told, "flags": self.flags,
+            "free": torch.zeros(n, dtype=torch.int32, device=like.device),
+            "motions": full(e, 12), "adjoints": full(e, 36), "rounded": plain(e, 12),
+            "edge_part": full(e * chunks, _EDGE_SUMS), "edge_sums": full(e, _EDGE_SUMS),
+            "pair_part": full(depth * layout.pairs * chunks, _PAIR_SUMS),
+            "pair_sums": full(layout.pairs, _PAIR_SUMS),
+            "turned": full(e, 36), "own": full(layout.sources, 36),
+            "E": plain(depth * e, 6, cells), "curvature": plain(depth * e, cells),
+            "gradient": plain(depth * e, cells), "Q": plain(depth * layout.sources, cells),
+            "rhs": plain(depth * layout.sources, cells), "steps": plain(e, 6),
+            "energy_part": full((e + n) * chunks),
+        }  # fmt: skip
+        self.job = Job(
+            frames=n, edges=e, height=h, width=w, sources=layout.sources, pairs=layout.pairs,
+            blocks=layout.blocks, chunk=CHUNK, chunks=chunks, stride=layout.stride,
+            motion_only=int(problem.motion_only), floor=_FLOOR[like.dtype],
+            **{name: tensor.data_ptr() for name, tensor in self.held.items()},
+        )  # fmt: skip
+
+
+def _key(problem: BAProblem) -> tuple[Any, ...]:
+    d = problem.disps
+    return (d.shape, d.dtype, d.device, problem.ii.shape, problem.motion_only)
 
 
 class KernelStepper:
@@ -61,155 +109,93 @@ class KernelStepper:
         self, library: KernelLibrary, halvings: int = 4, tiled_from: int = TILED_FROM
     ) -> None:
         self._library, self._halvings, self._tiled_from = library, halvings, tiled_from
-        self._work = Workspace()
-        self._layout: KernelLayout | None = None
+        self._scratch: _Scratch | None = None
 
     @torch.no_grad()
     def step(self, problem: BAProblem) -> Step:
         """One damped step; see `BAProblem` and `Report`.
 
         Raises:
-            ValueError: an edge names a frame that does not exist.
+            ValueError: an edge names a frame that does not exist, or shapes do not fit.
             RuntimeError: a launch failed.
         """
         problem = _ready(problem)
-        attempt = _Attempt(self, problem, self._held(problem), False)
+        scratch, fresh = self._prepared(problem)
+        attempt = _Attempt(self._library, problem, scratch, check=False)
         found = attempt.run()
-        if not found.same:
-            self._layout = None
-            attempt = _Attempt(self, problem, self._held(problem), False)
+        if found.flags[_OTHER_EDGES] and not fresh:
+            self._scratch = None
+            scratch, _ = self._prepared(problem)
+            attempt = _Attempt(self._library, problem, scratch, check=False)
             found = attempt.run()
         if found.flags[_BAD_SUMS]:
-            attempt = _Attempt(self, problem, attempt.layout, True)
+            attempt = _Attempt(self._library, problem, scratch, check=True)
             found = attempt.run()
             if found.flags[_BAD_SUMS]:
                 report = Report("nonfinite", math.nan, dropped=found.dropped)
                 return Step(problem.T_cw.clone(), problem.disps.clone(), report)
         return attempt.conclude(found, self._halvings)
 
-    def _held(self, problem: BAProblem) -> KernelLayout:
-        held, frames = self._layout, problem.disps.shape[0]
-        if (
-            held is None
-            or held.frames != frames
-            or held.ii.shape != problem.ii.shape
-            or held.ii.device != problem.ii.device
-        ):
-            held = make_kernel_layout(problem.ii, problem.jj, frames, self._tiled_from)
-            self._layout = held
-        return held
+    def _prepared(self, problem: BAProblem) -> tuple[_Scratch, bool]:
+        """Scratch memory that fits, and whether its order was made for these very edges."""
+        held, key = self._scratch, _key(problem)
+        if held is not None and held.key == key:
+            return held, False
+        frames = problem.disps.shape[0]
+        layout = make_kernel_layout(problem.ii, problem.jj, frames, self._tiled_from)
+        self._scratch = None  # its memory first, so that both need not fit
+        self._scratch = _Scratch(problem, layout)
+        return self._scratch, True
 
 
 class _Attempt:
     """One pass through the kernels with fixed assumptions."""
 
     def __init__(
-        self, stepper: KernelStepper, problem: BAProblem, layout: KernelLayout, check: bool
+        self, library: KernelLibrary, problem: BAProblem, scratch: _Scratch, check: bool
     ) -> None:
-        self._library, self._work = stepper._library, stepper._work
-        self.problem, self.layout = problem, layout
-        self._prior = problem.prior is not None and problem.prior_weight > 0
-        self._job = self._make_job(check)
-
-    def _take(self, name: str, *shape: int, full: bool = False) -> Tensor:
-        like = self._g if full else self.problem.disps
-        return self._work.take(name, *shape, like=like)
-
-    def _make_job(self, check: bool) -> Job:
-        p, layout = self.problem, self.layout
-        n, h, w = p.disps.shape
-        e, cells = p.ii.shape[0], h * w
-        chunks = chunks_of(cells)
-        device = p.disps.device
-        self._g = torch.empty(6 * n, dtype=torch.float64, device=device)
-        self._flags = torch.zeros(4, dtype=torch.int32, device=device)
-        self._free = torch.zeros(n, dtype=torch.int32, device=device)
-        self._system = self._take("system", layout.system_size, full=True).zero_()
-        self._least = self._take("least", 6 * n, full=True)
-        self._edge_sums = self._take("edge_sums", e, _EDGE_SUMS, full=True)
-        self._energy_part = self._take("energy_part", (e + n) * chunks, full=True)
-        self._moved = self._take("moved", e, 12)
+        self._library, self._scratch, self.problem = library, scratch, problem
+        p, job = problem, scratch.job
         self.T_out, self.disps_out = torch.empty_like(p.T_cw), torch.empty_like(p.disps)
-        depth = 0 if p.motion_only else 1
-        job = Job()
-        sizes = {
-            "frames": n, "edges": e, "height": h, "width": w, "sources": layout.sources,
-            "pairs": layout.pairs, "blocks": layout.blocks, "chunk": CHUNK, "chunks": chunks,
-            "stride": layout.stride, "motion_only": int(p.motion_only), "check": int(check),
-        }  # fmt: skip
-        options = {
-            "prior_weight": p.prior_weight, "lm": p.lm, "ep": p.ep, "scale": 1.0,
-            "huber": -1.0 if p.huber is None else p.huber, "min_disp": p.min_disp,
-            "max_disp": math.inf if p.max_disp is None else p.max_disp,
-            "floor": _FLOOR[p.disps.dtype],
-        }  # fmt: skip
-        tensors: dict[str, Tensor] = {
-            "T_cw": p.T_cw, "disps": p.disps, "intrinsics": p.intrinsics, "target": p.target,
-            "weight": p.weight, "damping": p.damping, "fixed": p.fixed, **layout.arrays,
-            "motions": self._take("motions", e, 12, full=True),
-            "adjoints": self._take("adjoints", e, 36, full=True),
-            "edge_part": self._take("edge_part", e * chunks, _EDGE_SUMS, full=True),
-            "edge_sums": self._edge_sums,
-            "pair_part": self._take("pair_part", depth * layout.pairs * chunks, 42, full=True),
-            "pair_sums": self._take("pair_sums", layout.pairs, _PAIR_SUMS, full=True),
-            "turned": self._take("turned", e, 36, full=True),
-            "own": self._take("own", layout.sources, 36, full=True),
-            "system": self._system, "g": self._g, "least": self._least,
-            "rounded": self._take("rounded", e, 12),
-            "E": self._take("E", depth * e, 6, cells),
-            "curvature": self._take("curvature", depth * e, cells),
-            "gradient": self._take("gradient", depth * e, cells),
-            "Q": self._take("Q", depth * layout.sources, cells),
-            "rhs": self._take("rhs", depth * layout.sources, cells),
-            "steps": self._take("steps", e, 6),
-            "free": self._free, "flags": self._flags, "energy_part": self._energy_part,
-            "T_out": self.T_out, "disps_out": self.disps_out,
-        }  # fmt: skip
-        if self._prior and p.prior is not None:
-            tensors["prior"] = p.prior
-        for name, number in {**sizes, **options}.items():
-            setattr(job, name, number)
-        for name, tensor in tensors.items():
-            setattr(job, name, tensor.data_ptr())
-        return job
+        prior = p.prior if p.prior_weight > 0 else None
+        for name in _GIVEN:
+            setattr(job, name, getattr(p, name).data_ptr())
+        job.prior = None if prior is None else prior.data_ptr()
+        job.given_ii, job.given_jj = p.ii.data_ptr(), p.jj.data_ptr()
+        job.T_out, job.disps_out = self.T_out.data_ptr(), self.disps_out.data_ptr()
+        job.prior_weight, job.lm, job.ep, job.scale = p.prior_weight, p.lm, p.ep, 1.0
+        job.huber = -1.0 if p.huber is None else p.huber
+        job.min_disp = p.min_disp
+        job.max_disp = math.inf if p.max_disp is None else p.max_disp
+        job.check = int(check)
 
     def run(self) -> _Found:
         """All kernels of a full step, and one transfer."""
-        p, layout = self.problem, self.layout
-        n = p.disps.shape[0]
+        s, n = self._scratch, self.problem.disps.shape[0]
+        s.flags.zero_()
+        s.system.zero_()
         self._call("system")
-        self._call("prior_energy", p.disps.data_ptr())
-        prior = self._prior_sum()
-        if layout.tiles is None:
-            system = self._system.view(6 * n, 6 * n)
-            dx, solved = solve_dense(system, self._g, self._least)
+        tiles = s.layout.tiles
+        if tiles is None:
+            dx, factor, info = solve_dense(s.system.view(6 * n, 6 * n), s.g)
+            s.job.factor, s.job.info = factor.data_ptr(), info.data_ptr()
         else:
-            tiles = self._system.view(len(layout.tiles.index), layout.stride, layout.stride)
-            dx, solved = solve_tiled(tiles, layout.tiles, self._g, self._least)
+            stored = s.system.view(len(tiles.index), s.layout.stride, s.layout.stride)
+            dx, solved = solve_tiled(stored, tiles, s.g, s.least)
+            s.flags[_SINGULAR:].copy_(~solved)
+            s.job.factor = None
         self._dx = dx.contiguous()
-        self._job.dx = self._dx.data_ptr()
-        if not p.motion_only:
-            self._call("substitute")
-        self._call("move")
-        same = (p.ii == layout.ii).all() & (p.jj == layout.jj).all()
-        told = torch.cat(
-            [
-                torch.stack([x.double() for x in (same, solved, prior)]),
-                self._flags.double(),
-                self._edge_sums[:, _ENERGY:].sum(0),  # energy, dropped measurements
-                self._dx.view(n, 6).norm(dim=1).amax(0, keepdim=True),
-                self._free.double(),
-            ]
-        ).tolist()
+        s.job.dx = self._dx.data_ptr()
+        self._call("finish")
+        told = s.told.tolist()
+        states = told[_FLAGS + 3 :]
         return _Found(
-            same=bool(told[0]),
-            solved=bool(told[1]),
-            prior=told[2],
-            flags=tuple(bool(x) for x in told[3:7]),
-            energy=told[7],
-            dropped=int(told[8]) if math.isfinite(told[8]) else 0,
-            norm=told[9],
-            free=tuple(int(x) for x in told[10:]),
+            flags=tuple(bool(x) for x in told[:_FLAGS]),
+            energy=told[_FLAGS],
+            dropped=int(told[_FLAGS + 1]) if math.isfinite(told[_FLAGS + 1]) else 0,
+            prior=told[_FLAGS + 2],
+            free=tuple(int(x) for x in states[:n]),
+            norm=max(states[n:]),
         )
 
     def conclude(self, found: _Found, halvings: int) -> Step:
@@ -221,7 +207,7 @@ class _Attempt:
         moves = 1 in found.free
         if not moves and not (found.flags[_CURVED] or found.flags[_PRIOR]):
             return self._unchanged(replace(report, status="empty"))
-        if not found.solved:
+        if found.flags[_SINGULAR]:
             return self._unchanged(replace(report, status="singular"))
         if found.flags[_BAD_STEP]:
             return self._unchanged(replace(report, status="nonfinite"))
@@ -231,7 +217,7 @@ class _Attempt:
         for attempt in range(halvings + 1):
             scale = 0.5**attempt
             if attempt:
-                self._job.scale = scale
+                self._scratch.job.scale = scale
                 self._call("move")
             after = self._energy()
             if after <= before:
@@ -241,24 +227,17 @@ class _Attempt:
 
     def _energy(self) -> float:
         """Energy of the moved state."""
-        p = self.problem
-        moved = (self.T_out.data_ptr(), self.disps_out.data_ptr(), self._moved.data_ptr())
-        self._call("energy", *moved)
-        self._call("prior_energy", self.disps_out.data_ptr())
-        measured = p.ii.shape[0] * self._job.chunks
-        return float(self._energy_part[:measured].sum() + p.prior_weight * self._prior_sum())
-
-    def _prior_sum(self) -> Tensor:
-        if not self._prior or self.problem.motion_only:
-            return self._g.new_zeros(())
-        return self._energy_part[self.problem.ii.shape[0] * self._job.chunks :].sum()
+        state = (self.T_out, self.disps_out, self._scratch.moved)
+        self._call("energy", *(tensor.data_ptr() for tensor in state))
+        energy, _, prior = self._scratch.told[_FLAGS : _FLAGS + 3].tolist()
+        return float(energy + self.problem.prior_weight * prior)
 
     def _unchanged(self, report: Report) -> Step:
         return Step(self.problem.T_cw.clone(), self.problem.disps.clone(), report)
 
     def _call(self, name: str, *pointers: int) -> None:
-        p = self.problem
-        self._library.call(name, self._job, p.disps.dtype, p.disps.device, pointers)
+        disps = self.problem.disps
+        self._library.call(name, self._scratch.job, disps.dtype, disps.device, pointers)
 
 
 def _ready(problem: BAProblem) -> BAProblem:

@@ -146,7 +146,8 @@ class NativeKernels:
         def ready(value: Tensor) -> Tensor:
             return value.to("cpu", dtype).contiguous()
 
-        ii, jj = problem.ii.long().contiguous(), problem.jj.long().contiguous()
+        ii = problem.ii.to("cpu", torch.int64).contiguous()
+        jj = problem.jj.to("cpu", torch.int64).contiguous()
         T_cw, disps = ready(problem.T_cw), ready(problem.disps)
         target, weight = ready(problem.target), ready(problem.weight)
         damping = ready(problem.damping)

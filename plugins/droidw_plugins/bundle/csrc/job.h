@@ -11,7 +11,8 @@ constexpr int EDGE_SUMS = POSE_SUMS + 2, ENERGY = POSE_SUMS, DROPPED = POSE_SUMS
 // Sums of a pair of edges: E_a Q E_b^T, then E_a Q rhs where a is b.
 constexpr int PAIR_SUMS = 36 + 6;
 
-enum Flag { BAD_SUMS = 0, CURVED = 1, PRIOR = 2, BAD_STEP = 3 };
+enum Flag { BAD_SUMS = 0, CURVED = 1, PRIOR = 2, BAD_STEP = 3, OTHER_EDGES = 4, SINGULAR_SYSTEM = 5 };
+constexpr int FLAGS = 6;
 
 // Mirrors droidw_plugins.bundle._kernel_calls.Job. Void pointers are of the problem's type.
 struct Job {
@@ -32,8 +33,14 @@ struct Job {
     void *rounded, *E, *curvature, *gradient, *Q, *rhs, *steps;
     int32_t *free, *flags;
     double* energy_part;
-    // Result.
+    // Result, and what is read back: flags, energy, dropped, prior energy, then the state and the norm
+    // of the step of every pose.
     void *T_out, *disps_out;
+    double* told;
+    const int64_t *given_ii, *given_jj;  // edges of the caller, and those that the order was made for
+    const int64_t *held_ii, *held_jj;
+    const double* factor;                // Cholesky factor, where it is one dense matrix
+    const int32_t* info;
 
     DW_HD int64_t cells() const { return height * width; }
     DW_HD int64_t cells_of_chunk(int64_t c) const {

@@ -12,6 +12,7 @@ namespace dw {
 template <class S>
 int launch_system(const Job& job, void* stream) {
     Queue queue(stream);
+    map(queue, job.edges, CompareEdges{job});
     map(queue, job.edges, RelativeMotions<S>{
         job, static_cast<const S*>(job.T_cw), reinterpret_cast<Motion<double>*>(job.motions),
         static_cast<Motion<S>*>(job.rounded)});
@@ -31,18 +32,31 @@ int launch_system(const Job& job, void* stream) {
 }
 
 template <class S>
-int launch_substitute(const Job& job, void* stream) {
-    Queue queue(stream);
-    map(queue, job.edges, SeenSteps<S>{job});
-    map(queue, job.sources * job.cells(), Substitute<S>{job});
-    return queue.code();
-}
-
-template <class S>
 int launch_move(const Job& job, void* stream) {
     Queue queue(stream);
     map(queue, job.frames, MovePoses<S>{job});
     map(queue, job.frames * job.cells(), MoveDepths<S>{job});
+    return queue.code();
+}
+
+// Everything between the solution of the system and what is read back.
+template <class S>
+int launch_finish(const Job& job, void* stream) {
+    Queue queue(stream);
+    if (job.factor) map(queue, 6 * job.frames, CheckPivots{job});
+    if (!job.motion_only) {
+        map(queue, job.edges, SeenSteps<S>{job});
+        map(queue, job.sources * job.cells(), Substitute<S>{job});
+    }
+    map(queue, job.frames, MovePoses<S>{job});
+    map(queue, job.frames * job.cells(), MoveDepths<S>{job});
+    reduce<2>(queue, 1, EdgeEnergy{job}, job.told + FLAGS);
+    const int64_t chunks = job.prior && !job.motion_only ? job.frames * job.chunks : 0;
+    double* const part = job.energy_part + job.edges * job.chunks;
+    reduce<1>(queue, chunks, PriorEnergy<S>{job, static_cast<const S*>(job.disps)}, part);
+    reduce<1>(queue, 1, RowSum{part, chunks}, job.told + FLAGS + 2);
+    map(queue, job.frames, TellPoses{job});
+    map(queue, FLAGS, TellFlags{job});
     return queue.code();
 }
 
@@ -54,15 +68,10 @@ int launch_energy(const Job& job, const void* T_cw, const void* disps, void* mov
     map(queue, job.edges, RelativeMotions<S>{job, static_cast<const S*>(T_cw), nullptr, to});
     const int64_t groups = job.edges * job.chunks;
     reduce<1>(queue, groups, MovedEnergy<S>{job, d, to}, job.energy_part);
-    return queue.code();
-}
-
-template <class S>
-int launch_prior_energy(const Job& job, const void* disps, void* stream) {
-    Queue queue(stream);
-    const int64_t groups = job.prior && !job.motion_only ? job.frames * job.chunks : 0;
-    reduce<1>(queue, groups, PriorEnergy<S>{job, static_cast<const S*>(disps)},
-              job.energy_part + job.edges * job.chunks);
+    const int64_t chunks = job.prior && !job.motion_only ? job.frames * job.chunks : 0;
+    reduce<1>(queue, chunks, PriorEnergy<S>{job, d}, job.energy_part + groups);
+    reduce<1>(queue, 1, RowSum{job.energy_part, groups}, job.told + FLAGS);
+    reduce<1>(queue, 1, RowSum{job.energy_part + groups, chunks}, job.told + FLAGS + 2);
     return queue.code();
 }
 
@@ -81,8 +90,8 @@ DW_API int32_t dw_kernels_version() { return 1; }
 DW_API int32_t dw_system(const dw::Job* job, int32_t size, void* stream) {
     return DW_BY_SIZE(launch_system)(*job, stream);
 }
-DW_API int32_t dw_substitute(const dw::Job* job, int32_t size, void* stream) {
-    return DW_BY_SIZE(launch_substitute)(*job, stream);
+DW_API int32_t dw_finish(const dw::Job* job, int32_t size, void* stream) {
+    return DW_BY_SIZE(launch_finish)(*job, stream);
 }
 DW_API int32_t dw_move(const dw::Job* job, int32_t size, void* stream) {
     return DW_BY_SIZE(launch_move)(*job, stream);
@@ -90,9 +99,6 @@ DW_API int32_t dw_move(const dw::Job* job, int32_t size, void* stream) {
 DW_API int32_t dw_energy(const dw::Job* job, const void* T_cw, const void* disps, void* moved,
                          int32_t size, void* stream) {
     return DW_BY_SIZE(launch_energy)(*job, T_cw, disps, moved, stream);
-}
-DW_API int32_t dw_prior_energy(const dw::Job* job, const void* disps, int32_t size, void* stream) {
-    return DW_BY_SIZE(launch_prior_energy)(*job, disps, stream);
 }
 DW_API int32_t dw_frame_distance(const dw::Pairs* job, int32_t size, void* stream) {
     return DW_BY_SIZE(launch_frame_distance)(*job, stream);

@@ -353,4 +353,57 @@ struct PriorEnergy {
     }
 };
 
+// Flags for edges other than those that the order of work was made for.
+struct CompareEdges {
+    Job job;
+    DW_KERNEL void operator()(int64_t e) const {
+        if (job.given_ii[e] != job.held_ii[e] || job.given_jj[e] != job.held_jj[e])
+            job.flags[OTHER_EDGES] = 1;
+    }
+};
+
+// Flags a system that could not be factorised, or whose pivots are rounding.
+struct CheckPivots {
+    Job job;
+    DW_KERNEL void operator()(int64_t k) const {
+        const double pivot = job.factor[k * (6 * job.frames + 1)];
+        if (!(pivot * pivot > job.least[k]) || *job.info != 0) job.flags[SINGULAR_SYSTEM] = 1;
+    }
+};
+
+struct EdgeEnergy {
+    using Sum = double;
+    Job job;
+    DW_KERNEL int64_t items(int64_t) const { return job.edges; }
+    DW_KERNEL void operator()(int64_t, int64_t e, double* sums) const {
+        sums[0] += job.edge_sums[e * EDGE_SUMS + ENERGY];
+        sums[1] += job.edge_sums[e * EDGE_SUMS + DROPPED];
+    }
+};
+
+// Sum of a row of numbers.
+struct RowSum {
+    using Sum = double;
+    const double* values;
+    int64_t count;
+    DW_KERNEL int64_t items(int64_t) const { return count; }
+    DW_KERNEL void operator()(int64_t, int64_t k, double* sums) const { sums[0] += values[k]; }
+};
+
+struct TellPoses {
+    Job job;
+    DW_KERNEL void operator()(int64_t frame) const {
+        double* const told = job.told + FLAGS + 3;
+        double sum = 0;
+        for (int k = 0; k < 6; ++k) sum += job.dx[6 * frame + k] * job.dx[6 * frame + k];
+        told[frame] = double(job.free[frame]);
+        told[job.frames + frame] = sqrt(sum);
+    }
+};
+
+struct TellFlags {
+    Job job;
+    DW_KERNEL void operator()(int64_t k) const { job.told[k] = double(job.flags[k]); }
+};
+
 }  // namespace dw
