@@ -64,6 +64,14 @@ class CameraConfig:
     long_side: int = opt(320, "working size: the longer side is reduced to this, in pixels", ge=64)
     size: list[int] = opt([], "working size [width, height] instead of `long_side`")
     edge: int = opt(0, "pixels cropped off each side after resizing", ge=0)
+    refine_focal: bool = opt(True, "look for a better focal length in global adjustment")
+    focal_trust: float = opt(
+        10.0,
+        "how hard a known focal length is to move: relative curvature of its prior; one that "
+        "was guessed has a tenth of it",
+        ge=0,
+    )
+    focal_range: float = opt(0.3, "largest change of the logarithm of the focal length", gt=0, le=1)
 
 
 @dataclass
@@ -121,12 +129,13 @@ class FrontendConfig:
     nms: int = opt(2, "suppression radius around existing edges", ge=0)
     max_factors: int = opt(75, "active edges at most", ge=4)
     max_age: int = opt(12, "updates after which an edge is retired", ge=1)
-    predict: Literal["velocity", "hold", "damped"] = opt(
+    predict: Literal["match", "velocity", "hold", "damped"] = opt(
         "velocity",
-        "velocity: go on with the last motion and depth; hold: last pose, mean depth; "
+        "velocity: go on with the last motion and depth; match: then move to where the last "
+        "keyframe is found again; hold: last pose, mean depth; "
         "damped: half of the last motion, median depth",
     )
-    mirror: bool = opt(True, "at initialisation, try the scene turned inside out as well")
+    starts: bool = opt(True, "at initialisation, try several starts and keep what fits best")
     redundant: Literal["newest", "middle"] = opt(
         "newest",
         "which keyframe is dropped where too little moved: the newest, if near to the one before; "

@@ -155,7 +155,13 @@ class _Run:
         parts = self._build()
         threads = "threads" in self.resolved.parts["correspondence"][0].capabilities
         system = SlamSystem(
-            self.config, parts, rectify.camera, self.device, self.events, threaded=threads
+            self.config,
+            parts,
+            rectify.camera,
+            self.device,
+            self.events,
+            threaded=threads,
+            focal_known=not guessed,
         )
         self.built = time.perf_counter()
 
@@ -173,7 +179,12 @@ class _Run:
         if not system.frames:
             raise Interrupted("stopped by a signal before the first frame", self.stop.signum)
         outcome = system.finish(frames, brief=failure is not None or self.stop.signum > 0)
-        result = self._export(system, source, outcome, rectify)
+        if system.focal is not None and system.focal.factor != 1.0:
+            self.said += (
+                f"; focal length refined to {system.focal.factor:.3f} times that, "
+                f"{camera.fx * system.focal.factor:.1f} px of the raw picture"
+            )
+        result = self._export(system, source, outcome)
         self._conclude(failure, result, outcome)
         return result
 
@@ -247,9 +258,7 @@ class _Run:
             "parts": {slot: part.name for slot, (part, _) in self.resolved.parts.items()},
         }
 
-    def _export(
-        self, system: SlamSystem, source: FrameSource, outcome: Outcome, rectify: Rectifier
-    ) -> RunResult:
+    def _export(self, system: SlamSystem, source: FrameSource, outcome: Outcome) -> RunResult:
         warnings = self.events
         for text in (*outcome.diagnosis.warnings(), *(self.masks.problems() if self.masks else ())):
             warnings.warn(text)
@@ -269,12 +278,12 @@ class _Run:
             trajectory=outcome.trajectory,
             keyframes=outcome.keyframes,
             cloud=outcome.cloud,
-            camera=rectify.camera,
+            camera=system.camera,
             stride=system.grid.stride,
             offset=system.grid.offset,
             source=self.config.input.source,
             truth=truth,
-            manifest=self._manifest(system, source, outcome, rectify),
+            manifest=self._manifest(system, source, outcome),
             run_dir=self.run_dir,
         )
         total = len(self.resolved.exporters)
@@ -290,7 +299,7 @@ class _Run:
         metrics = self._score_masks(metrics)
         if metrics is not None:
             write_json(self.run_dir / "metrics.json", metrics)
-        manifest = self._manifest(system, source, outcome, rectify)
+        manifest = self._manifest(system, source, outcome)
         result = replace(result, manifest=manifest, warnings=tuple(warnings.warnings))
         write_json(self.run_dir / "manifest.json", {**manifest, "warnings": warnings.warnings})
         self.events.emit(RunFinished(result, self.run_dir, metrics))
@@ -317,7 +326,7 @@ class _Run:
             return metrics
 
     def _manifest(
-        self, system: SlamSystem, source: FrameSource, outcome: Outcome, rectify: Rectifier
+        self, system: SlamSystem, source: FrameSource, outcome: Outcome
     ) -> dict[str, Any]:
         # written after the manifest has been put together
         later = {"manifest.json"}
@@ -325,7 +334,7 @@ class _Run:
             later.add("report.html")
         return {
             "source": self.config.input.source,
-            **facts_of_tracking(system, source, outcome, rectify.camera),
+            **facts_of_tracking(system, source, outcome),
             **facts_of_time(
                 system,
                 len(outcome.trajectory),

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from droidw.config.resolve import ResolvedConfig
-    from droidw.geometry.camera import Camera
     from droidw.interfaces.datasets import FrameSource
     from droidw.slam.system import Outcome, SlamSystem
 
@@ -113,10 +112,9 @@ REPORTS = {
 """What the optimiser counts -> the sentence for the user."""
 
 
-def facts_of_tracking(
-    system: SlamSystem, source: FrameSource, outcome: Outcome, camera: Camera
-) -> dict[str, Any]:
+def facts_of_tracking(system: SlamSystem, source: FrameSource, outcome: Outcome) -> dict[str, Any]:
     """How much was read and tracked, and with which working camera."""
+    camera = system.camera
     return {
         "frames": len(outcome.trajectory),
         "last_frame": system.last_index,

@@ -11,6 +11,7 @@ import torch
 from droidw.geometry.projective import frame_distance
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import backend_edges, frontend_edges
+from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,11 +27,21 @@ _CHUNK = 2048
 
 
 class Backend:
-    """Rebuilds a graph over the whole sequence and optimises it."""
+    """Rebuilds a graph over the whole sequence and optimises it.
 
-    def __init__(self, optimiser: Optimiser, config: DroidwConfig) -> None:
+    Args:
+        focal_known: the focal length is a calibration, not a guess.
+    Attributes:
+        focal: what the search for a better focal length found, None without one.
+    """
+
+    def __init__(
+        self, optimiser: Optimiser, config: DroidwConfig, focal_known: bool = True
+    ) -> None:
         self.optimiser = optimiser
         self.config = config
+        self.focal_known = focal_known
+        self.focal: FocalSearch | None = None
 
     def run(self, tell: Callable[[int, int], None]) -> int:
         """All passes of the configuration.
@@ -67,6 +78,15 @@ class Backend:
                 done += 1
                 tell(done, total)
             edges = len(graph)
+            if number == 0 and self.config.camera.refine_focal and len(store) >= MIN_KEYFRAMES:
+                self.focal = refine_focal(
+                    self.optimiser,
+                    graph,
+                    phase,
+                    self.config.global_solver,
+                    self.config.camera,
+                    self.focal_known,
+                )
             if number == len(options.passes) - 1:
                 self._upsample(session, shown)
         return edges

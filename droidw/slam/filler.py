@@ -10,11 +10,8 @@ import torch
 from torch import Tensor
 
 from droidw.geometry.interpolate import interpolate
-from droidw.geometry.projective import reproject
 from droidw.geometry.se3 import exp, inv, log, mul
-from droidw.interfaces.correspondence import EdgeRequest
-from droidw.solve.problem import BAProblem
-from droidw.solve.weights import residual_weights
+from droidw.slam.locate import locate
 
 if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig
@@ -74,69 +71,16 @@ class Filler:
         return list(self._refine(batch, start, updates).unbind(0))
 
     def _refine(self, batch: list[Encoded], start: Tensor, updates: int) -> Tensor:
-        store, optimiser = self.optimiser.store, self.optimiser
-        wanted = [sorted(set(self._sources(e.frame.time))) for e in batch]
-        used = sorted({k for ks in wanted for k in ks})
-        local = {k: n for n, k in enumerate(used)}
-        nodes = [store.payload(k) for k in used] + [e.payload for e in batch]
-        pairs = [(local[k], len(used) + f) for f, ks in enumerate(wanted) for k in ks]
-        device = store.device
-        ii = torch.tensor([i for i, _ in pairs], dtype=torch.int64, device=device)
-        jj = torch.tensor([j for _, j in pairs], dtype=torch.int64, device=device)
-        at = torch.tensor(used, dtype=torch.int64, device=device)
-        T_cw = torch.cat([store.T_cw[at], start])
-        blank = store.disps.new_ones(len(batch), *store.disps.shape[1:])
-        disps = torch.cat([store.disps[at], blank])
-        gates = torch.cat([self._gates[at], blank])
-        fixed = torch.arange(len(T_cw), device=device) < len(used)
-        session = optimiser.parts.correspondence.session("fill")
-        phase, solver = self.config.schedule["fill"], self.config.filler_solver
-        for _ in range(updates):
-            with optimiser.clock("fill: reproject"):
-                coords, valid = reproject(T_cw, disps, store.intrinsics, ii, jj)
-            with optimiser.clock("fill: correspondence"):
-                answer = session.update(
-                    EdgeRequest(
-                        ids=list(range(len(pairs))),
-                        ii=[i for i, _ in pairs],
-                        jj=[j for _, j in pairs],
-                        coords=coords,
-                        valid=valid,
-                        payload=nodes.__getitem__,
-                    )
-                )
-            weighting = self.config.weighting
-            weight = residual_weights(
-                answer.confidence,
-                None,
-                gates,
-                ii,
-                jj,
-                answer.target,
-                bidirectional=False,
-                scale=weighting.confidence_scale,
-            )
-            with optimiser.clock("fill: bundle"):
-                for _ in range(phase.iterations):
-                    step = optimiser.parts.ba.step(
-                        BAProblem(
-                            T_cw=T_cw,
-                            disps=disps,
-                            intrinsics=store.intrinsics,
-                            ii=ii,
-                            jj=jj,
-                            target=answer.target,
-                            weight=weight,
-                            fixed=fixed,
-                            damping=torch.zeros_like(disps),
-                            motion_only=True,
-                            lm=solver.lm,
-                            ep=solver.ep,
-                            huber=solver.huber or None,
-                        )
-                    )
-                    T_cw = step.T_cw
-        return T_cw[len(used) :]
+        return locate(
+            self.optimiser,
+            [encoded.payload for encoded in batch],
+            start,
+            [sorted(set(self._sources(encoded.frame.time))) for encoded in batch],
+            self._gates,
+            updates=updates,
+            iterations=self.config.schedule["fill"].iterations,
+            solver=self.config.filler_solver,
+        )
 
     def _sources(self, time: float) -> list[int]:
         before, after = self.neighbours(time)

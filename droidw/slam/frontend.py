@@ -12,6 +12,8 @@ from droidw.geometry.projective import frame_distance
 from droidw.geometry.se3 import exp, inv, log, mul
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import frontend_edges, neighbour_edges
+from droidw.slam.locate import carry_depth, locate
+from droidw.slam.starts import mirrored, plane_starts
 
 if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig
@@ -21,6 +23,11 @@ __all__ = ["Frontend"]
 
 # More keyframes than this in a row are never dropped.
 _MOST_DROPS = 5
+# Gauss-Newton steps of a start at initialisation, and the share of the energy that it must beat.
+_TRIAL_STEPS = 15
+_BETTER = 0.98
+# Gauss-Newton steps that bring a new keyframe to its predecessor.
+_MATCH_STEPS = 4
 
 
 class Frontend:
@@ -66,8 +73,8 @@ class Frontend:
         schedule, options = self.config.schedule, self.options
         self.graph.add(neighbour_edges(count, 3))
         self._updates("init_blind", first_free=1, informed=False)
-        if options.mirror:
-            self._try_reversed()
+        if options.starts:
+            self._try_mirrored()
         for phase in ("init", "init_again"):
             updates = schedule[phase].updates
             if updates:
@@ -75,6 +82,8 @@ class Frontend:
                 self._updates(phase, first_free=1)
             if phase == "init_again":
                 self.graph.grow_older(self.graph.select(), -updates)
+            if phase == "init" and options.starts and self._try_again():
+                self._updates(phase, first_free=1)
             self._retire([r for r in self.graph.select() if self.graph.ii[r] < count - 4])
         self._recent = 4
         self.initialised = True
@@ -83,35 +92,43 @@ class Frontend:
         """Drop what correspondence holds of the window; nothing can be grown afterwards."""
         self.session.forget(list(self.graph.ids))
 
-    def _try_reversed(self) -> None:
-        """Leave the mirrored solution if that is where the first keyframes have converged to.
-
-        Seen from afar, a scene with its depth turned inside out and the camera moving the other
-        way, turned so that the middle of the picture moves alike, explains the flow almost as
-        well, and Gauss-Newton cannot cross from one to the other. Both are tried, and the one of
-        lower energy stays.
-        """
+    def _try_mirrored(self) -> None:
+        """Leave the mirrored solution if that is where the first keyframes have converged to."""
         store = self.store
         found = store.T_cw.clone(), store.disps.clone()
-        cost = self._settled_cost()
-        mean = store.disps.mean(dim=(1, 2), keepdim=True)
-        t = store.T_cw[:, :3]
-        turn = torch.zeros_like(store.T_cw[:, :6])
-        middle = mean[:, 0, 0].mean()
-        turn[:, 3] = -2.0 * middle * t[:, 1]
-        turn[:, 4] = 2.0 * middle * t[:, 0]
-        mirrored = mul(exp(turn), store.T_cw)
-        mirrored[:, :3] = -t * t.new_tensor([1.0, 1.0, 0.0])
-        store.write(mirrored, (2.0 * mean - store.disps).clamp_min(0.1 * mean))
+        cost = self._settled_cost(weigh=False)
+        store.write(*mirrored(*found))
         self._updates("init_blind", first_free=1, informed=False)
-        if not self._settled_cost() < cost:
+        if not self._settled_cost(weigh=False) < cost:
             store.write(*found)
 
-    def _settled_cost(self) -> float:
-        """Energy at the present poses and depths, without the say of uncertainty."""
+    def _try_again(self) -> bool:
+        """Start over from planes, now that uncertainty has its say, and keep what fits best.
+
+        What moves by itself has pulled at the first solution, while nothing was known of it.
+        """
+        store = self.store
+        best = store.T_cw.clone(), store.disps.clone()
+        phase = replace(self.config.schedule["init"], iterations=_TRIAL_STEPS, learn=False)
+        rows = list(range(len(self.graph)))
+        cost = _BETTER * self._settled_cost(weigh=True)
+        better = False
+        for start in plane_starts(store.disps):
+            store.write(*start)
+            self.optimiser.adjust(self.graph, rows, phase, self.config.solver, first_free=1)
+            found = self._settled_cost(weigh=True)
+            if found < cost:
+                cost, better = found, True
+                best = store.T_cw.clone(), store.disps.clone()
+        store.write(*best)
+        return better
+
+    def _settled_cost(self, weigh: bool) -> float:
+        """Energy of all edges at the present poses and depths, with uncertainty or without."""
         before = self.store.T_cw.clone(), self.store.disps.clone()
-        phase = replace(self.config.schedule["init_blind"], iterations=1, learn=False, weigh=False)
-        rows = self.graph.select()
+        row = self.config.schedule["init_blind"]
+        phase = replace(row, iterations=1, learn=False, weigh=weigh)
+        rows = list(range(len(self.graph)))
         self.optimiser.adjust(self.graph, rows, phase, self.config.solver, first_free=1)
         self.store.write(*before)
         return self.optimiser.cost
@@ -128,9 +145,35 @@ class Frontend:
                 informed=informed,
             )
 
+    def _match_newest(self) -> None:
+        """Pose and depth of the newest keyframe from what it shares with its predecessor.
+
+        Later searches start from what geometry predicts, and a fast camera is soon far from
+        where its last motion would have brought it.
+        """
+        store, last = self.store, len(self.store) - 1
+        phase = self.config.schedule["fill"]
+        found = locate(
+            self.optimiser,
+            [store.payload(last)],
+            store.T_cw[last:].clone(),
+            [[last - 1]],
+            self.optimiser.gates(learned=phase.weigh),
+            updates=1,
+            iterations=_MATCH_STEPS,
+            solver=self.config.filler_solver,
+            label="match",
+        )
+        store.T_cw[last:] = found
+        store.disps[last] = carry_depth(
+            store.disps[last - 1], store.T_cw[last - 1 :], store.intrinsics
+        )
+
     def _window(self, forced: bool) -> int | None:
         options, graph, store = self.options, self.graph, self.store
         count = len(store)
+        if options.predict == "match":
+            self._match_newest()
         self._recent = 1
         self._retire([r for r in graph.select() if graph.age[r] > options.max_age])
         self._propose(

@@ -21,6 +21,7 @@ from droidw.slam.backend import Backend
 from droidw.slam.cloud import consistent_depth, static_cloud
 from droidw.slam.diagnosis import Diagnosis, diagnose, parallax
 from droidw.slam.filler import Filler
+from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
 from droidw.slam.motion_filter import Encoded, MotionFilter, look_ahead
@@ -59,6 +60,10 @@ class SlamSystem:
         device: where tensors live.
         events: who hears what happens.
         threaded: whether correspondence may be called from threads ahead of time.
+        focal_known: the focal length of `camera` is a calibration, not a guess.
+    Attributes:
+        camera: the working camera, after `finish` with the focal length that was found.
+        focal: what the search for that came to, None where there was none.
     """
 
     def __init__(
@@ -70,10 +75,13 @@ class SlamSystem:
         events: Dispatcher | None = None,
         *,
         threaded: bool = False,
+        focal_known: bool = True,
     ) -> None:
         self.config = config
         self.parts = parts
         self.camera = camera
+        self.focal: FocalSearch | None = None
+        self._focal_known = focal_known
         self.events = events or Dispatcher()
         wait = torch.cuda.synchronize if device.type == "cuda" else None
         self.clock = Stopwatch(wait)
@@ -225,9 +233,9 @@ class SlamSystem:
             self._hold_still()
         elif not brief:
             with self.clock("global"):
-                Backend(self.optimiser, self.config).run(
-                    lambda done, total: self.events.emit(Progress("global", done, total))
-                )
+                backend = Backend(self.optimiser, self.config, self._focal_known)
+                backend.run(lambda done, total: self.events.emit(Progress("global", done, total)))
+                self._refined(backend.focal)
         with self.clock("fill"):
             trajectory = self._trajectory(reread, quick=brief or found.still)
         with self.clock("cloud"):
@@ -237,6 +245,13 @@ class SlamSystem:
         if not found.still:
             found = replace(found, parallax=parallax(self.store))
         return Outcome(trajectory, records, cloud, found)
+
+    def _refined(self, focal: FocalSearch | None) -> None:
+        """Take over the focal length that global adjustment found."""
+        self.focal = focal
+        if focal is not None and focal.factor != 1.0:
+            fx, fy = self.camera.fx * focal.factor, self.camera.fy * focal.factor
+            self.camera = replace(self.camera, fx=fx, fy=fy)
 
     def _hold_still(self) -> None:
         """A camera at rest: every pose is the first, and no depth can be known."""

@@ -15,7 +15,7 @@ PAPER = {
     "frontend.keyframe_threshold": 3.0, "frontend.redundant": "newest",
     "frontend.threshold": 16.0, "frontend.window": 25, "frontend.radius": 2, "frontend.nms": 1,
     "frontend.max_factors": 75, "frontend.max_age": 50, "frontend.predict": "hold",
-    "frontend.mirror": False,
+    "frontend.starts": False,
     "backend.passes": [7, 12], "backend.beta": 0.75, "backend.threshold": 25.0,
     "backend.radius": 1, "backend.nms": 5, "backend.nms_shape": "square",
     "backend.normalize": False, "backend.factors_per_keyframe": 6,
@@ -36,7 +36,7 @@ PAPER = {
     "solver": {"lm": 1e-4, "ep": 0.1, "huber": 0.0, "guard": False},
     "global_solver": {"lm": 1e-5, "ep": 1e-2, "huber": 0.0, "guard": False},
     "filler_solver": {"lm": 1e-4, "ep": 0.1, "huber": 0.0, "guard": False},
-    "seed": 43, "compat": [],
+    "seed": 43, "compat": [], "camera.refine_focal": False,
 }  # fmt: skip
 OFF = {"learn": False, "weigh": False, "depth_prior": True}
 DROID_SLAM = {

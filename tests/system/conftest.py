@@ -21,7 +21,7 @@ QUICK = (
     "observers.report=null", "observers.progress=null",
     "motion_filter.threshold=0.4", "frontend.warmup=4",
     "schedule.init_blind.updates=3", "schedule.init.updates=3",
-    "backend.passes=[1]", "filler.updates=1",
+    "backend.passes=[1]", "filler.updates=1", "camera.refine_focal=false",
 )  # fmt: skip
 """Everything on, but little of it: a run takes about half a second."""
 

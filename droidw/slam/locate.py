@@ -1,0 +1,150 @@
+"""Poses of frames against keyframes whose poses and depths stay: motion only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from droidw.geometry.projective import NEAR, relative_pose, reproject
+from droidw.interfaces.correspondence import EdgeRequest
+from droidw.solve.problem import BAProblem
+from droidw.solve.weights import residual_weights
+
+if TYPE_CHECKING:
+    from droidw.config.schema import SolverConfig
+    from droidw.slam.optimise import Optimiser
+
+__all__ = ["carry_depth", "locate"]
+
+
+def locate(
+    optimiser: Optimiser,
+    payloads: list[Any],
+    start: Tensor,
+    sources: list[list[int]],
+    gates: Tensor,
+    *,
+    updates: int,
+    iterations: int,
+    solver: SolverConfig,
+    label: str = "fill",
+) -> Tensor:
+    """Refine the poses of F frames against keyframes that see the same.
+
+    Args:
+        payloads: what correspondence keeps of each frame.
+        start: [F,7] world to camera.
+        sources: keyframes to measure each frame from.
+        gates: [N,h,w] weights in [0,1] of all keyframes.
+        updates, iterations: correspondence updates, and Gauss-Newton steps after each.
+        label: under which the time is counted.
+    Returns:
+        [F,7]; the start where bundle adjustment could not move a frame.
+    """
+    store, weighting = optimiser.store, optimiser.weighting
+    used = sorted({k for ks in sources for k in ks})
+    local = {k: n for n, k in enumerate(used)}
+    nodes = [store.payload(k) for k in used] + payloads
+    pairs = [(local[k], len(used) + f) for f, ks in enumerate(sources) for k in ks]
+    device = store.device
+    ii = torch.tensor([i for i, _ in pairs], dtype=torch.int64, device=device)
+    jj = torch.tensor([j for _, j in pairs], dtype=torch.int64, device=device)
+    at = torch.tensor(used, dtype=torch.int64, device=device)
+    T_cw = torch.cat([store.T_cw[at], start])
+    blank = store.disps.new_ones(len(payloads), *store.disps.shape[1:])
+    disps = torch.cat([store.disps[at], blank])
+    open_ = torch.cat([gates[at], blank])
+    fixed = torch.arange(len(T_cw), device=device) < len(used)
+    session = optimiser.parts.correspondence.session("fill")
+    payload: Callable[[int], Any] = nodes.__getitem__
+    for _ in range(updates):
+        with optimiser.clock(f"{label}: reproject"):
+            coords, valid = reproject(T_cw, disps, store.intrinsics, ii, jj)
+        with optimiser.clock(f"{label}: correspondence"):
+            ids = list(range(len(pairs)))
+            answer = session.update(
+                EdgeRequest(ids, ii.tolist(), jj.tolist(), coords, valid, payload)
+            )
+        weight = residual_weights(
+            answer.confidence,
+            None,
+            open_,
+            ii,
+            jj,
+            answer.target,
+            bidirectional=False,
+            scale=weighting.confidence_scale,
+        )
+        with optimiser.clock(f"{label}: bundle"):
+            for _ in range(iterations):
+                problem = BAProblem(
+                    T_cw=T_cw,
+                    disps=disps,
+                    intrinsics=store.intrinsics,
+                    ii=ii,
+                    jj=jj,
+                    target=answer.target,
+                    weight=weight,
+                    fixed=fixed,
+                    damping=torch.zeros_like(disps),
+                    motion_only=True,
+                    lm=solver.lm,
+                    ep=solver.ep,
+                    huber=solver.huber or None,
+                )
+                T_cw = optimiser.parts.ba.step(problem).T_cw
+    return T_cw[len(used) :]
+
+
+def carry_depth(disps: Tensor, T_cw: Tensor, intrinsics: Tensor) -> Tensor:
+    """A depth map as it looks from another camera.
+
+    Args:
+        disps: [h,w] disparity of the first camera.
+        T_cw: [2,7] poses of the first and of the other camera.
+        intrinsics: [4] of the grid.
+    Returns:
+        [h,w] disparity of the other camera; of several cells that fall onto one the nearest
+        counts, and where none falls, the mean of the neighbours is spread inwards.
+    """
+    height, width = disps.shape
+    pair = torch.tensor([0, 1], device=disps.device)
+    both = torch.stack([disps, disps])
+    coords, valid = reproject(T_cw, both, intrinsics, pair[:1], pair[1:])
+    # disparity in the other camera: d / Z, with Z the relative depth of the point there
+    z = _relative_depth(T_cw, disps, intrinsics)
+    there = disps / z.clamp_min(NEAR)
+    x, y = (coords[0] + 0.5).floor().long().unbind(-1)
+    ok = valid[0] & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    flat = disps.new_zeros(height * width)
+    flat.scatter_reduce_(0, (y * width + x)[ok], there[ok], "amax")
+    carried = flat.view(height, width)
+    known = (carried > 0).to(disps.dtype)
+    if not bool(known.any()):
+        return disps.clone()
+    kernel = disps.new_ones(1, 1, 3, 3)
+    for _ in range(height + width):
+        if bool(known.all()):
+            break
+        total = torch.nn.functional.conv2d((carried * known)[None, None], kernel, padding=1)[0, 0]
+        count = torch.nn.functional.conv2d(known[None, None], kernel, padding=1)[0, 0]
+        carried = torch.where(known > 0, carried, total / count.clamp_min(1.0))
+        known = (known + count).clamp_max(1.0)
+    return carried
+
+
+def _relative_depth(T_cw: Tensor, disps: Tensor, intrinsics: Tensor) -> Tensor:
+    """Z [h,w] of the cells of the first camera in the other (REFERENCE 2.1)."""
+    from droidw.geometry import se3
+    from droidw.geometry.projective import pixel_grid
+
+    pair = torch.tensor([0, 1], device=disps.device)
+    G = relative_pose(T_cw, pair[:1], pair[1:])
+    row = se3.rotation(G)[0, 2].to(disps.dtype)
+    fx, fy, cx, cy = intrinsics.unbind()
+    xy = pixel_grid(*disps.shape, disps.dtype, disps.device)
+    ray = row[0] * (xy[..., 0] - cx) / fx + row[1] * (xy[..., 1] - cy) / fy + row[2]
+    return ray + G[0, 2].to(disps.dtype) * disps

@@ -1,0 +1,107 @@
+"""The search for a better focal length."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.config.schema import CameraConfig, PhaseConfig, SolverConfig, WeightingConfig
+from droidw.geometry import projective, se3
+from droidw.geometry.camera import Grid
+from droidw.graph.factors import FactorGraph
+from droidw.graph.proximity import neighbour_edges
+from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.slam.focal import minimise_with_prior, refine_focal
+from droidw.slam.optimise import Optimiser, Parts
+from droidw.slam.timing import Stopwatch
+from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
+
+PHASE = PhaseConfig(updates=1, iterations=2, learn=False, weigh=False, depth_prior=False)
+SOLVER = SolverConfig(lm=1e-6, ep=1e-6, huber=0.0)
+
+
+def valley(x):
+    return 100.0 * (1.0 + 8.0 * (x - 0.08) ** 2 + 5.0 * (x - 0.08) ** 3)
+
+
+def test_without_prior_the_valley_is_found():
+    x, tried = minimise_with_prior(valley, trust=0.0, bound=0.3)
+    assert x == pytest.approx(0.08, abs=0.004)
+    assert len(tried) <= 8 and tried[0] == (0.0, valley(0.0))
+
+
+def test_prior_pulls_back_by_the_ratio_of_curvatures():
+    def energy(x):
+        return 100.0 * (1.0 + 8.0 * (x - 0.08) ** 2)
+
+    at_zero = energy(0.0) / 100.0
+    x, _ = minimise_with_prior(energy, trust=10.0, bound=0.3)
+    assert x == pytest.approx(0.08 * 16.0 / (16.0 + 10.0 * at_zero), abs=1e-3)
+
+
+def test_bound_holds_on_a_slope():
+    x, _ = minimise_with_prior(lambda x: 2.0 - x, trust=0.0, bound=0.25)
+    assert x == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("broken", [math.nan, math.inf])
+def test_energy_that_is_not_finite_ends_the_search(broken):
+    x, tried = minimise_with_prior(lambda x: 1.0 if x == 0 else broken, trust=1.0, bound=0.3)
+    assert x == 0.0 and len(tried) == 3
+
+
+def bench(wrong: float):
+    """An optimiser over 12 keyframes with exact measurements, and a focal length that is off."""
+    h, w, count = 12, 16, 12
+    grid = Grid(h, w, 8, 3.5)
+    true = torch.tensor([110.0, 110.0, 63.5, 47.5])
+    given = true * torch.tensor([wrong, wrong, 1.0, 1.0])
+    store = KeyframeStore(grid, given)
+    s = torch.linspace(0, 1, count)
+    path = (0.8 * (5 * s).sin(), 0.3 * (7 * s).cos(), 0.2 * s, 0.2 * s.cos(), 0.5 * (4 * s).sin(), s)
+    T_cw = se3.exp(torch.stack(path, 1) * torch.tensor([1.0, 1, 1, 1, 1, 0.1]))
+    x, y = projective.pixel_grid(h, w).unbind(-1)
+    disps = torch.stack([0.6 + 0.2 * (0.6 * x + k).sin() + 0.1 * y.cos() for k in range(count)])
+    for k in range(count):
+        blank = np.zeros((h * 8, w * 8, 3), np.uint8)
+        store.append(KeyframeInfo(k, k / 10, "", blank, None), T_cw=T_cw[k], disps=disps[k])
+    graph = FactorGraph(h, w, store.device)
+    graph.add(neighbour_edges(count, 3))
+    ii, jj = graph.index(graph.select())
+    graph.target[:], valid = projective.reproject(T_cw, disps, grid.intrinsics(true), ii, jj)
+    graph.confidence[:] = valid[..., None].float()
+    parts = Parts(None, None, None, TorchBundleAdjuster(), None)
+    return Optimiser(store, parts, WeightingConfig(), Stopwatch()), graph, true
+
+
+def test_a_wrong_focal_length_is_found_from_exact_measurements():
+    optimiser, graph, true = bench(wrong=1.08)
+    camera = CameraConfig(focal_trust=0.0)
+    found = refine_focal(optimiser, graph, PHASE, SOLVER, camera, known=True)
+    assert found.factor == pytest.approx(1 / 1.08, rel=0.01)
+    store = optimiser.store
+    assert float(store.image_intrinsics[0]) == pytest.approx(float(true[0]), rel=0.01)
+    assert torch.allclose(store.intrinsics, store.grid.intrinsics(store.image_intrinsics))
+    assert torch.equal(store.image_intrinsics[2:], true[2:])
+
+
+def test_a_right_focal_length_stays():
+    optimiser, graph, _ = bench(wrong=1.0)
+    found = refine_focal(optimiser, graph, PHASE, SOLVER, CameraConfig(), known=True)
+    assert found.factor == pytest.approx(1.0, abs=0.003)
+
+
+def test_a_guess_moves_where_a_calibration_holds():
+    factors = []
+    for known in (True, False):
+        optimiser, graph, _ = bench(wrong=1.08)
+        # noise, without which any prior is weak beside an energy of zero
+        noise = torch.randn(graph.target.shape, generator=torch.Generator().manual_seed(0))
+        graph.target += 0.15 * noise
+        camera = CameraConfig(focal_trust=100.0)
+        found = refine_focal(optimiser, graph, PHASE, SOLVER, camera, known)
+        factors.append(abs(math.log(found.factor)))
+    assert factors[0] < factors[1]
