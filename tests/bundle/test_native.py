@@ -127,3 +127,20 @@ def test_auto_goes_on_with_torch_where_nothing_compiles(make, broken_compiler, c
     assert "kaput: line 7" in caplog.text
     p, _, _ = make(noise=0.02)
     assert built.step(p).report.status == "ok"
+
+
+def test_auto_goes_on_with_torch_where_kernels_compile_but_do_not_run(compiler, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("no kernel image is available")
+
+    monkeypatch.setattr(native_ba.NativeBundleAdjuster, "step", broken)
+    built = auto_ba.COMPONENT.factory(auto_ba.AutoBundleOptions(), CPU)
+    assert built.chosen == "torch"
+    assert "no kernel image" in built.reason
+
+
+def test_a_cache_that_cannot_be_written_is_named(compiler, monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv(_build.CACHE_VARIABLE, str(tmp_path / "file"))
+    with pytest.raises(_build.BuildError, match="DROIDW_CACHE"):
+        _build.build(native_recipe())

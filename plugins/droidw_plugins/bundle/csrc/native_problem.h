@@ -33,6 +33,8 @@ struct Report {
 
 // Cells that a thread works on before it goes to the next edge: small enough for the first cache.
 constexpr int BLOCK = 256;
+// Room of such a row of cells: rows that begin a power of two apart would share lines of the cache.
+constexpr int PLANE = BLOCK + 16;
 // Cells whose sums are kept in the precision of the problem before they go to double.
 constexpr int CHUNK = 1024;
 
@@ -101,7 +103,7 @@ struct Scratch {
     std::vector<S> E;
     std::vector<Pack<S>> lanes;
     void reserve(int64_t k) {
-        E.resize(std::max<size_t>(E.size(), size_t(k * 6 * BLOCK)));
+        E.resize(std::max<size_t>(E.size(), size_t(k * 6 * PLANE)));
         lanes.resize(std::max<size_t>(lanes.size(), size_t(Plan::sums_of(k))));
     }
 };

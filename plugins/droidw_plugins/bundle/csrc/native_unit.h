@@ -76,7 +76,7 @@ void edge_block(const View<S>& view, int64_t e, const Motion<S>& G, const S* d, 
         if (POSE && DEPTH) {
             R row[6];
             coupling(l, row);
-            for (int k = 0; k < 6; ++k) row[k].store(E + k * BLOCK + at);
+            for (int k = 0; k < 6; ++k) row[k].store(E + k * PLANE + at);
         }
         if (POSE) add_pose_sums(l, lanes);
     }
@@ -91,10 +91,10 @@ void pair_rows(const S* Ea, const S* Eb, const S* Q, int64_t n, Pack<S>* lanes) 
     R s0 = lanes[6], s1 = lanes[7], s2 = lanes[8], s3 = lanes[9], s4 = lanes[10], s5 = lanes[11];
     for (int64_t at = 0; at < n; at += R::lanes) {
         const R q = R::load(Q + at);
-        const R a = R::load(Ea + at) * q, b = R::load(Ea + BLOCK + at) * q;
+        const R a = R::load(Ea + at) * q, b = R::load(Ea + PLANE + at) * q;
 #define DW_ADD(c)                                      \
     if (c >= from) {                                   \
-        const R right = R::load(Eb + c * BLOCK + at);  \
+        const R right = R::load(Eb + c * PLANE + at);  \
         t##c += a * right;                             \
         s##c += b * right;                             \
     }
@@ -134,7 +134,7 @@ void linearise_unit(const View<S>& view, const Unit& unit, Scratch<S>& mine, Fou
             const int64_t a = e - source.first;
             if (e < source.active)
                 edge_block<S, true, DEPTH>(
-                    view, e, G, d, first, n, lanes + a * POSE_SUMS, mine.E.data() + a * 6 * BLOCK,
+                    view, e, G, d, first, n, lanes + a * POSE_SUMS, mine.E.data() + a * 6 * PLANE,
                     C, w, energy, dropped);
             else
                 edge_block<S, false, DEPTH>(
@@ -157,23 +157,23 @@ void linearise_unit(const View<S>& view, const Unit& unit, Scratch<S>& mine, Fou
         }
         R* pair = lanes_pairs;
         for (int64_t a = 0; a < k; ++a) {
-            const S* const Ea = mine.E.data() + a * 6 * BLOCK;
+            const S* const Ea = mine.E.data() + a * 6 * PLANE;
             R sums[6];
             for (int c = 0; c < 6; ++c) sums[c] = lanes_rhs[6 * a + c];
             for (int64_t at = 0; at < n; at += R::lanes) {
                 const R right = R::load(Qr + at);
-                for (int c = 0; c < 6; ++c) sums[c] += R::load(Ea + c * BLOCK + at) * right;
+                for (int c = 0; c < 6; ++c) sums[c] += R::load(Ea + c * PLANE + at) * right;
             }
             for (int c = 0; c < 6; ++c) lanes_rhs[6 * a + c] = sums[c];
             pair_rows<S, 0>(Ea, Ea, Q, n, pair);
-            pair_rows<S, 2>(Ea + 2 * BLOCK, Ea, Q, n, pair + 12);
-            pair_rows<S, 4>(Ea + 4 * BLOCK, Ea, Q, n, pair + 24);
+            pair_rows<S, 2>(Ea + 2 * PLANE, Ea, Q, n, pair + 12);
+            pair_rows<S, 4>(Ea + 4 * PLANE, Ea, Q, n, pair + 24);
             pair += 36;
             for (int64_t b = a + 1; b < k; ++b, pair += 36) {
-                const S* const Eb = mine.E.data() + b * 6 * BLOCK;
+                const S* const Eb = mine.E.data() + b * 6 * PLANE;
                 pair_rows<S, 0>(Ea, Eb, Q, n, pair);
-                pair_rows<S, 0>(Ea + 2 * BLOCK, Eb, Q, n, pair + 12);
-                pair_rows<S, 0>(Ea + 4 * BLOCK, Eb, Q, n, pair + 24);
+                pair_rows<S, 0>(Ea + 2 * PLANE, Eb, Q, n, pair + 12);
+                pair_rows<S, 0>(Ea + 4 * PLANE, Eb, Q, n, pair + 24);
             }
         }
     }
@@ -195,6 +195,8 @@ void substitute_unit(const View<S>& view, const Unit& unit, const double* steps)
     const Source& source = work.plan.sources[unit.source];
     const int64_t cells = work.plan.cells, frame = source.frame * cells;
     S d[BLOCK], sum[BLOCK];
+    // without a robust kernel the residual has no share in E: its target need not be read
+    const bool residuals = view.check || view.huber >= S(0);
     for (int64_t first = unit.begin; first < unit.end; first += BLOCK) {
         const int64_t n = std::min<int64_t>(BLOCK, unit.end - first);
         S* const dz = work.rhs.data() + unit.source * cells + first;
@@ -213,8 +215,8 @@ void substitute_unit(const View<S>& view, const Unit& unit, const double* steps)
             const Motion<S> G = rounded<S>(work.motions[e]);
             const S *target = view.target(e) + 2 * first, *weight = view.weight(e) + 2 * first;
             for (int64_t at = 0; at < n; at += R::lanes) {
-                R tu, tv, wu, wv;
-                Reader<S>::pair(target + 2 * at, n - at, tu, tv);
+                R tu(S(0)), tv(S(0)), wu, wv;
+                if (residuals) Reader<S>::pair(target + 2 * at, n - at, tu, tv);
                 Reader<S>::pair(weight + 2 * at, n - at, wu, wv);
                 if (view.check) drop_nonfinite(tu, tv, wu, wv);
                 const R here = R::load(d + at);
