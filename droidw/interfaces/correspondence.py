@@ -122,8 +122,8 @@ class Correspondence(Protocol):
     def motion(self, reference: Any, current: Any) -> Motion:
         """How far the picture moved from `reference` to `current` (payloads).
 
-        Called from worker threads, several at once, where the component has the capability
-        "threads".
+        Called in the order of the frames, so that a part may go by the motion so far; where
+        the component has the capability "threads", from another thread than sessions are.
         """
         ...
 

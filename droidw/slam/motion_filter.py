@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from droidw.interfaces.correspondence import Motion
 
@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from droidw.config.schema import MotionFilterConfig
     from droidw.interfaces.correspondence import Correspondence
     from droidw.slam.frame import Frame
+
+T = TypeVar("T")
 
 __all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead"]
 
@@ -44,35 +46,30 @@ class Verdict:
 class MotionFilter:
     """Compares each frame with the last candidate (REFERENCE 5.1).
 
-    Where correspondence may be called from threads, the motion of the frames ahead is measured
-    while the window is being optimised, on the guess that the reference stays the same.
+    What it says depends on the frames alone, so that it may run ahead of the window in a thread.
 
     Args:
         correspondence: measures motion.
         options: thresholds.
-        pool: threads to work ahead with, or None.
     """
 
     def __init__(
         self,
         correspondence: Correspondence,
         options: MotionFilterConfig,
-        pool: ThreadPoolExecutor | None = None,
     ) -> None:
         self._correspondence = correspondence
         self._options = options
-        self._pool = pool
         self._reference: Encoded | None = None
         self._last_index: int | None = None
         self._lost = 0
-        self._ahead: dict[tuple[int, int], Future[Motion]] = {}
 
     def judge(self, current: Encoded) -> Verdict:
         """Whether `current` becomes a keyframe; if so it is the reference from now on."""
         if self._reference is None:
             self._accept(current)
             return Verdict(keep=True, forced=False, motion=None)
-        motion = self._measure(self._reference, current)
+        motion = self._correspondence.motion(self._reference.payload, current.payload)
         options = self._options
         last = self._reference.frame.index if self._last_index is None else self._last_index
         gap = current.frame.index - last
@@ -94,47 +91,33 @@ class MotionFilter:
         """Frame `index` has become a keyframe for good: frames are counted from it."""
         self._last_index = index
 
-    def expect(self, ahead: Iterable[Encoded]) -> None:
-        """Start measuring these frames against the reference, if there are threads for it."""
-        if self._pool is None or self._reference is None:
-            return
-        reference = self._reference
-        for encoded in ahead:
-            key = (reference.frame.index, encoded.frame.index)
-            if key not in self._ahead:
-                self._ahead[key] = self._pool.submit(
-                    self._correspondence.motion, reference.payload, encoded.payload
-                )
-
     def _accept(self, current: Encoded) -> None:
         self._reference = current
         self._lost = 0
-        for future in self._ahead.values():
-            future.cancel()
-        self._ahead.clear()
-
-    def _measure(self, reference: Encoded, current: Encoded) -> Motion:
-        future = self._ahead.pop((reference.frame.index, current.frame.index), None)
-        if future is not None and not future.cancelled():
-            return future.result()
-        return self._correspondence.motion(reference.payload, current.payload)
 
 
-def look_ahead(
-    items: Iterable[Encoded], depth: int, expect: Callable[[Iterable[Encoded]], None]
-) -> Iterator[Encoded]:
-    """Yield items in order while up to `depth` of those to come are announced to `expect`."""
-    waiting: deque[Encoded] = deque()
+def look_ahead(items: Iterable[T], depth: int, pool: ThreadPoolExecutor | None) -> Iterator[T]:
+    """Yield items in order, while a thread makes up to `depth` of those to come.
+
+    Args:
+        items: made one after the other, in whichever thread.
+        pool: of one thread, or None to make each item when it is asked for.
+    """
+    if pool is None:
+        yield from items
+        return
     source = iter(items)
-    exhausted = False
-    while True:
-        while not exhausted and len(waiting) <= depth:
-            try:
-                waiting.append(next(source))
-            except StopIteration:
-                exhausted = True
-        if not waiting:
-            return
-        current = waiting.popleft()
-        yield current
-        expect(waiting)
+    waiting: deque[Future[T | None]] = deque()
+    try:
+        while True:
+            while len(waiting) <= depth:
+                waiting.append(pool.submit(next, source, None))
+            item = waiting.popleft().result()
+            if item is None:
+                return
+            yield item
+    finally:
+        # The source may not be closed while the thread is inside it.
+        for future in waiting:
+            if not future.cancel():
+                wait([future])

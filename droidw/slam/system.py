@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from droidw.slam.filler import Filler
 from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
-from droidw.slam.motion_filter import Encoded, MotionFilter, look_ahead
+from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict, look_ahead
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.timing import Stopwatch
 
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Outcome", "SlamSystem"]
 
-# Frames whose motion is measured ahead of the one being judged.
+# Frames that are encoded and judged ahead of the one being tracked.
 _LOOK_AHEAD = 6
 
 
@@ -59,7 +58,7 @@ class SlamSystem:
         camera: the working camera (after rectification).
         device: where tensors live.
         events: who hears what happens.
-        threaded: whether correspondence may be called from threads ahead of time.
+        threaded: whether correspondence may be called from another thread, ahead of time.
         focal_known: the focal length of `camera` is a calibration, not a guess.
     Attributes:
         camera: the working camera, after `finish` with the focal length that was found.
@@ -106,9 +105,10 @@ class SlamSystem:
         )
         self.optimiser = Optimiser(self.store, parts, config.weighting, self.clock)
         self.frontend = Frontend(self.optimiser, config)
-        workers = config.threads or os.cpu_count() or 1
-        self._pool = ThreadPoolExecutor(workers, "ahead") if threaded else None
-        self._filter = MotionFilter(op, config.motion_filter, self._pool)
+        # Keyframes forced by a count depend on which the window has kept: nothing runs ahead then.
+        ahead = threaded and config.motion_filter.force_every == 0
+        self._pool = ThreadPoolExecutor(1, "ahead") if ahead else None
+        self._filter = MotionFilter(op, config.motion_filter)
         self._times: list[float] = []
         self._indices: list[int] = []
         self._moved: list[float] = []
@@ -129,24 +129,26 @@ class SlamSystem:
     # -- tracking --------------------------------------------------------------------------
 
     def track(self, frames: Iterable[Frame]) -> None:
-        """Push all frames, with motion measured ahead of the window where that is possible."""
-        encoded = (self._encode(frame) for frame in frames)
-        depth = _LOOK_AHEAD if self._pool is not None else 0
-        for item in look_ahead(encoded, depth, self._filter.expect):
-            self._push(item)
+        """Push all frames; the motion filter runs ahead of the window where it can."""
+        judged = (self._judge(frame) for frame in frames)
+        for current, verdict in look_ahead(judged, _LOOK_AHEAD, self._pool):
+            self._push(current, verdict)
 
     def push(self, frame: Frame) -> bool:
         """Track one frame; returns whether it is a keyframe now."""
-        return self._push(self._encode(frame))
+        return self._push(*self._judge(frame))
+
+    def _judge(self, frame: Frame) -> tuple[Encoded, Verdict]:
+        current = self._encode(frame)
+        with self.clock("motion filter"):
+            return current, self._filter.judge(current)
 
     def _encode(self, frame: Frame) -> Encoded:
         with self.clock("encode"):
             return Encoded(frame, self.parts.correspondence.encode(frame, self.grid))
 
-    def _push(self, current: Encoded) -> bool:
+    def _push(self, current: Encoded, verdict: Verdict) -> bool:
         frame = current.frame
-        with self.clock("motion filter"):
-            verdict = self._filter.judge(current)
         self._times.append(frame.time)
         self._indices.append(frame.index)
         if verdict.motion is not None:

@@ -7,25 +7,25 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
-import torch
 
-from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate, Motion, Purpose
+from droidw.interfaces.correspondence import Motion, Purpose
+from droidw_plugins.correspondence._flow_session import FlowSession
+from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Track
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Grid
     from droidw.slam.frame import Frame
     from droidw_plugins.correspondence.flow import FlowOptions
 
-Array = npt.NDArray[np.float32]
-
 # Flow fields kept at full size between the motion filter and the edges that want them.
-_FULL_FIELDS = 24
+_FULL_FIELDS = 64
+# Matched share below which the motion so far says nothing of the next picture.
+_TRACKED = 0.1
 # Grid flows kept for the filler: some ten kilobytes each.
 _GRID_FIELDS = 20_000
 # Median distance of two starts, in cells, that lead to the same result.
@@ -36,31 +36,6 @@ _FLAT = 0.1
 _PAIRS = 4_000
 
 
-@dataclass(frozen=True)
-class FlowFrame:
-    """Payload of one frame: grey image [H,W] uint8 and texture [h,w,2] at the cells.
-
-    `texture` is the root mean square image derivative that fixes a match along x and along y,
-    in grey levels per pixel, over the neighbourhood of a cell.
-    """
-
-    index: int
-    grey: npt.NDArray[np.uint8]
-    texture: Array
-    centres: Array
-    stride: int
-
-
-@dataclass
-class _Edge:
-    """What is known of one directed edge: displacement and confidence on the grid."""
-
-    target: Array
-    confidence: Array
-    started: Array | None
-    searches: int = 1
-
-
 class FlowCorrespondence:
     """Measures flow between pairs of frames with a small pool of threads."""
 
@@ -68,13 +43,14 @@ class FlowCorrespondence:
         self.options = options
         self.stride = options.stride
         self.offset = (options.stride - 1) / 2
+        self._track: Track | None = None
         workers = options.workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
         self._local = threading.local()
         self._lock = threading.Lock()
         self._full: OrderedDict[tuple[int, int], Array] = OrderedDict()
         self._grid: OrderedDict[tuple[int, int], tuple[Array, Array]] = OrderedDict()
-        self._pairs: OrderedDict[tuple[int, int, bool], tuple[_Edge, _Edge]] = OrderedDict()
+        self._pairs: OrderedDict[tuple[int, int, bool], tuple[Edge, Edge]] = OrderedDict()
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
         """Grey image and texture at the cells."""
@@ -102,15 +78,27 @@ class FlowCorrespondence:
         return payload
 
     def motion(self, reference: FlowFrame, current: FlowFrame) -> Motion:
-        """Flow from the reference, judged by brightness agreement only."""
-        if not (current.texture.max(axis=-1) > 0.5 * self.options.texture).any():
-            return Motion(0.0, 0.0)  # a blank picture agrees with whatever is as bright
-        moved, agrees = self._one_way(reference, current, self._forward)
-        return self._motion(moved, agrees, reference)
+        """Flow from the reference, judged by brightness agreement only.
 
-    def session(self, purpose: Purpose = "window") -> _FlowSession:
+        The search starts where a picture that goes on moving as it did would be: a free search
+        loses a camera that is fast before walls with little on them.
+        """
+        if not (current.texture.max(axis=-1) > 0.5 * self.options.texture).any():
+            self._track = None
+            return Motion(0.0, 0.0)  # a blank picture agrees with whatever is as bright
+        start = None if self._track is None else self._track.ahead(reference, current)
+        moved, agrees = self._one_way(
+            reference, current, lambda a, b: self._remember(a, b, self._search(a, b, start))
+        )
+        motion = self._motion(moved, agrees, reference)
+        known = motion.matched > _TRACKED
+        flow = self._remembered(reference, current) if known else None
+        self._track = None if flow is None else Track.after(self._track, reference, current, flow)
+        return motion
+
+    def session(self, purpose: Purpose = "window") -> FlowSession:
         """Fresh edge state; flows already measured are shared between sessions."""
-        return _FlowSession(self, one_way=purpose == "fill", fine=purpose == "global")
+        return FlowSession(self, one_way=purpose == "fill", fine=purpose == "global")
 
     # -- measuring -------------------------------------------------------------------------
 
@@ -145,19 +133,22 @@ class FlowCorrespondence:
         flow: Array = engine.calc(a.grey, b.grey, None if start is None else start.copy())
         return flow
 
-    def _forward(self, a: FlowFrame, b: FlowFrame) -> Array:
-        """Unstarted flow a -> b, remembered for a while."""
-        key = (a.index, b.index)
+    def _remembered(self, a: FlowFrame, b: FlowFrame) -> Array | None:
+        """A dense flow a -> b that was measured not long ago."""
         with self._lock:
-            known = self._full.get(key)
-        if known is not None:
-            return known
-        flow = self._search(a, b)
+            return self._full.get((a.index, b.index))
+
+    def _remember(self, a: FlowFrame, b: FlowFrame, flow: Array) -> Array:
         with self._lock:
-            self._full[key] = flow
+            self._full[(a.index, b.index)] = flow
             while len(self._full) > _FULL_FIELDS:
                 self._full.popitem(last=False)
         return flow
+
+    def free(self, a: FlowFrame, b: FlowFrame, start: Array | None = None) -> Array:
+        """Flow a -> b without geometry, remembered for a while; `start` [H,W,2] where known."""
+        known = self._remembered(a, b)
+        return self._remember(a, b, self._search(a, b, start)) if known is None else known
 
     def _one_way(
         self, a: FlowFrame, b: FlowFrame, search: Callable[[FlowFrame, FlowFrame], Array]
@@ -193,12 +184,12 @@ class FlowCorrespondence:
         agreement: Array = inside / (1.0 + (difference / tolerance) ** 2)
         return agreement.astype(np.float32)
 
-    def one_way(self, a: FlowFrame, b: FlowFrame) -> _Edge:
+    def one_way(self, a: FlowFrame, b: FlowFrame) -> Edge:
         """Edge a -> b without the way back."""
         moved, agrees = self._one_way(a, b, self._search)
         confidence = agrees[..., None] * self._texture_weight(a)
         target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
-        return _Edge(target, confidence, None)
+        return Edge(target, confidence, None)
 
     def both_ways(
         self,
@@ -207,7 +198,7 @@ class FlowCorrespondence:
         start_ab: Array | None,
         start_ba: Array | None,
         fine: bool = False,
-    ) -> tuple[_Edge, _Edge]:
+    ) -> tuple[Edge, Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
         What an earlier session found from about the same start is as good as a new search.
@@ -221,11 +212,11 @@ class FlowCorrespondence:
         ):
             return replace(known[0]), replace(known[1])
         if start_ab is None:
-            ab = self._forward(a, b)
+            ab = self.free(a, b)
         else:
             ab = self._search(a, b, self._dense(start_ab, a), fine)
         if start_ba is None:
-            ba = self._forward(b, a)
+            ba = self.free(b, a)
         else:
             ba = self._search(b, a, self._dense(start_ba, b), fine)
         both = self._checked(a, ab, ba, start_ab), self._checked(b, ba, ab, start_ba)
@@ -252,7 +243,7 @@ class FlowCorrespondence:
         bounded: Array = np.clip(dense, -2.0 * width, 2.0 * width).astype(np.float32)
         return bounded
 
-    def _checked(self, a: FlowFrame, ab: Array, ba: Array, started: Array | None) -> _Edge:
+    def _checked(self, a: FlowFrame, ab: Array, ba: Array, started: Array | None) -> Edge:
         moved = _at(ab, a.centres)
         there = a.centres + moved
         back = _at(ba, there, outside=1e4)
@@ -262,7 +253,7 @@ class FlowCorrespondence:
         confidence[error2 > opt.cutoff**2] = 0.0
         weight = confidence[..., None].astype(np.float32) * self._texture_weight(a)
         target = ((there - self.offset) / self.stride).astype(np.float32)
-        return _Edge(target, weight, started)
+        return Edge(target, weight, started)
 
     def _texture_weight(self, a: FlowFrame) -> Array:
         if self.options.texture <= 0:
@@ -276,91 +267,6 @@ class FlowCorrespondence:
         if len(jobs) < 2:
             return [job() for job in jobs]
         return list(self._pool.map(lambda job: job(), jobs))
-
-
-class _FlowSession:
-    """Edges measured once, and again when geometry says that the search went elsewhere."""
-
-    def __init__(self, owner: FlowCorrespondence, *, one_way: bool, fine: bool) -> None:
-        self._owner = owner
-        self._one_way = one_way
-        self._fine = fine
-        self._edges: dict[int, _Edge] = {}
-
-    def forget(self, ids: list[int]) -> None:
-        """Drop edges."""
-        for edge_id in ids:
-            self._edges.pop(edge_id, None)
-
-    def update(self, request: EdgeRequest) -> EdgeUpdate:
-        """Measure what is new or has moved away; return the state of all edges."""
-        coords = request.coords.detach().cpu().numpy()
-        new = [row for row, edge_id in enumerate(request.ids) if edge_id not in self._edges]
-        wanted = sorted(new + self._astray(request, coords))
-        if self._one_way:
-            self._measure_one_way(request, wanted)
-        else:
-            self._measure_pairs(request, wanted, coords)
-        if not request.ids:
-            return EdgeUpdate(torch.zeros_like(request.coords), torch.zeros_like(request.coords))
-        edges = [self._edges[edge_id] for edge_id in request.ids]
-        device = request.coords.device
-        target = torch.from_numpy(np.stack([e.target for e in edges])).to(device)
-        confidence = torch.from_numpy(np.stack([e.confidence for e in edges])).to(device)
-        return EdgeUpdate(target, confidence)
-
-    def _astray(self, request: EdgeRequest, coords: Array) -> list[int]:
-        """Rows where most confident cells lie far from the prediction of good geometry."""
-        opt = self._owner.options
-        if self._one_way or not request.informed:
-            return []
-        rows = [
-            row
-            for row, edge_id in enumerate(request.ids)
-            if edge_id in self._edges and self._edges[edge_id].searches <= opt.restarts
-        ]
-        if not rows:
-            return []
-        edges = [self._edges[request.ids[row]] for row in rows]
-        sure = np.stack([e.confidence.max(axis=-1) for e in edges]) > 0.1
-        away = np.abs(coords[rows] - np.stack([e.target for e in edges])).max(axis=-1)
-        known = sure.mean(axis=(1, 2))
-        far = ((away > opt.restart) & sure).mean(axis=(1, 2))
-        return [row for row, k, f in zip(rows, known, far, strict=True) if k < 0.02 or f > k / 2]
-
-    def _measure_one_way(self, request: EdgeRequest, wanted: list[int]) -> None:
-        def job(row: int) -> Callable[[], _Edge]:
-            a, b = request.payload(request.ii[row]), request.payload(request.jj[row])
-            return lambda: self._owner.one_way(a, b)
-
-        for row, edge in zip(wanted, self._owner.map([job(r) for r in wanted]), strict=True):
-            self._edges[request.ids[row]] = edge
-
-    def _measure_pairs(self, request: EdgeRequest, wanted: list[int], coords: Array) -> None:
-        """One job per unordered pair, since the check needs both directions anyway."""
-        pairs: dict[tuple[int, int], dict[bool, int]] = {}
-        for row in wanted:
-            i, j = request.ii[row], request.jj[row]
-            pairs.setdefault((min(i, j), max(i, j)), {})[i < j] = row
-
-        def start(row: int | None) -> Array | None:
-            if row is None or not request.informed:
-                return None
-            valid = request.valid[row].cpu().numpy()
-            return coords[row] if valid.mean() > 0.5 else None
-
-        def job(key: tuple[int, int], rows: dict[bool, int]) -> Callable[[], Any]:
-            a, b = request.payload(key[0]), request.payload(key[1])
-            starts = start(rows.get(True)), start(rows.get(False))
-            return lambda: self._owner.both_ways(a, b, *starts, self._fine)
-
-        measured = self._owner.map([job(key, rows) for key, rows in pairs.items()])
-        for rows, both in zip(pairs.values(), measured, strict=True):
-            for forward, row in rows.items():
-                edge = both[0 if forward else 1]
-                old = self._edges.get(request.ids[row])
-                edge.searches = old.searches + 1 if old else 1
-                self._edges[request.ids[row]] = edge
 
 
 def _close(one: Array | None, other: Array | None) -> bool:

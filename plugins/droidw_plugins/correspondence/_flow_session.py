@@ -1,0 +1,102 @@
+"""The edges of one graph, measured by correspondence `flow`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate
+from droidw_plugins.correspondence._flow_types import Array, Edge
+
+if TYPE_CHECKING:
+    from droidw_plugins.correspondence._flow import FlowCorrespondence
+
+__all__ = ["FlowSession"]
+
+
+class FlowSession:
+    """Edges measured once, and again when geometry says that the search went elsewhere."""
+
+    def __init__(self, owner: FlowCorrespondence, *, one_way: bool, fine: bool) -> None:
+        self._owner = owner
+        self._one_way = one_way
+        self._fine = fine
+        self._edges: dict[int, Edge] = {}
+
+    def forget(self, ids: list[int]) -> None:
+        """Drop edges."""
+        for edge_id in ids:
+            self._edges.pop(edge_id, None)
+
+    def update(self, request: EdgeRequest) -> EdgeUpdate:
+        """Measure what is new or has moved away; return the state of all edges."""
+        coords = request.coords.detach().cpu().numpy()
+        new = [row for row, edge_id in enumerate(request.ids) if edge_id not in self._edges]
+        wanted = sorted(new + self._astray(request, coords))
+        if self._one_way:
+            self._measure_one_way(request, wanted)
+        else:
+            self._measure_pairs(request, wanted, coords)
+        if not request.ids:
+            return EdgeUpdate(torch.zeros_like(request.coords), torch.zeros_like(request.coords))
+        edges = [self._edges[edge_id] for edge_id in request.ids]
+        device = request.coords.device
+        target = torch.from_numpy(np.stack([e.target for e in edges])).to(device)
+        confidence = torch.from_numpy(np.stack([e.confidence for e in edges])).to(device)
+        return EdgeUpdate(target, confidence)
+
+    def _astray(self, request: EdgeRequest, coords: Array) -> list[int]:
+        """Rows where most confident cells lie far from the prediction of good geometry."""
+        opt = self._owner.options
+        if self._one_way or not request.informed:
+            return []
+        rows = [
+            row
+            for row, edge_id in enumerate(request.ids)
+            if edge_id in self._edges and self._edges[edge_id].searches <= opt.restarts
+        ]
+        if not rows:
+            return []
+        edges = [self._edges[request.ids[row]] for row in rows]
+        sure = np.stack([e.confidence.max(axis=-1) for e in edges]) > 0.1
+        away = np.abs(coords[rows] - np.stack([e.target for e in edges])).max(axis=-1)
+        known = sure.mean(axis=(1, 2))
+        far = ((away > opt.restart) & sure).mean(axis=(1, 2))
+        return [row for row, k, f in zip(rows, known, far, strict=True) if k < 0.02 or f > k / 2]
+
+    def _measure_one_way(self, request: EdgeRequest, wanted: list[int]) -> None:
+        def job(row: int) -> Callable[[], Edge]:
+            a, b = request.payload(request.ii[row]), request.payload(request.jj[row])
+            return lambda: self._owner.one_way(a, b)
+
+        for row, edge in zip(wanted, self._owner.map([job(r) for r in wanted]), strict=True):
+            self._edges[request.ids[row]] = edge
+
+    def _measure_pairs(self, request: EdgeRequest, wanted: list[int], coords: Array) -> None:
+        """One job per unordered pair, since the check needs both directions anyway."""
+        pairs: dict[tuple[int, int], dict[bool, int]] = {}
+        for row in wanted:
+            i, j = request.ii[row], request.jj[row]
+            pairs.setdefault((min(i, j), max(i, j)), {})[i < j] = row
+
+        def start(row: int | None) -> Array | None:
+            if row is None or not request.informed:
+                return None
+            valid = request.valid[row].cpu().numpy()
+            return coords[row] if valid.mean() > 0.5 else None
+
+        def job(key: tuple[int, int], rows: dict[bool, int]) -> Callable[[], Any]:
+            a, b = request.payload(key[0]), request.payload(key[1])
+            starts = start(rows.get(True)), start(rows.get(False))
+            return lambda: self._owner.both_ways(a, b, *starts, self._fine)
+
+        measured = self._owner.map([job(key, rows) for key, rows in pairs.items()])
+        for rows, both in zip(pairs.values(), measured, strict=True):
+            for forward, row in rows.items():
+                edge = both[0 if forward else 1]
+                old = self._edges.get(request.ids[row])
+                edge.searches = old.searches + 1 if old else 1
+                self._edges[request.ids[row]] = edge

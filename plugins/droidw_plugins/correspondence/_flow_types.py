@@ -1,0 +1,81 @@
+"""What correspondence `flow` keeps: of a frame, of an edge, and of the motion so far."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["Array", "Edge", "FlowFrame", "Track"]
+
+Array = npt.NDArray[np.float32]
+
+# Frames that may be missing before the motion so far is forgotten.
+_LONGEST_GAP = 3
+
+
+@dataclass(frozen=True)
+class FlowFrame:
+    """Payload of one frame: grey image [H,W] uint8 and texture [h,w,2] at the cells.
+
+    `texture` is the root mean square image derivative that fixes a match along x and along y,
+    in grey levels per pixel, over the neighbourhood of a cell.
+    """
+
+    index: int
+    grey: npt.NDArray[np.uint8]
+    texture: Array
+    centres: Array
+    stride: int
+
+
+@dataclass
+class Edge:
+    """What is known of one directed edge: displacement and confidence on the grid."""
+
+    target: Array
+    confidence: Array
+    started: Array | None
+    searches: int = 1
+
+
+@dataclass(frozen=True)
+class Track:
+    """The motion filter's last flow, and how it was growing.
+
+    Attributes:
+        reference, current: frames between which `flow` holds.
+        flow: [H,W,2] pixels, reference to current.
+        velocity: [H,W,2] pixels per frame.
+    """
+
+    reference: int
+    current: int
+    flow: Array
+    velocity: Array
+
+    @classmethod
+    def after(
+        cls, before: Track | None, reference: FlowFrame, current: FlowFrame, flow: Array
+    ) -> Track:
+        """The track one measurement later."""
+        if before is not None and before.reference == reference.index:
+            velocity = (flow - before.flow) / np.float32(max(current.index - before.current, 1))
+        else:
+            velocity = flow / np.float32(max(current.index - reference.index, 1))
+        return cls(reference.index, current.index, flow, velocity)
+
+    def ahead(self, reference: FlowFrame, current: FlowFrame) -> Array | None:
+        """The flow from `reference` to a later frame if all goes on; None if that is unknown.
+
+        The velocity belongs to pixels of an older frame: good enough for a start.
+        """
+        gap = current.index - self.current
+        if not 0 < gap <= _LONGEST_GAP:
+            return None
+        if reference.index == self.reference:
+            return self.flow + self.velocity * np.float32(gap)
+        if reference.index == self.current:
+            return self.velocity * np.float32(gap)
+        return None
