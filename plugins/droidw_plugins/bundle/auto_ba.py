@@ -107,4 +107,5 @@ COMPONENT: Component[BundleAdjuster] = Component(
     factory=_build,
     options=AutoBundleOptions,
     capabilities=frozenset({"cpu", "cuda"}),
+    reference="DROID-SLAM, Teed and Deng 2021, section 3.3; own code",
 )
