@@ -78,7 +78,7 @@ class CameraConfig:
 class MotionFilterConfig:
     """Which frames become candidates for keyframes."""
 
-    threshold: float = opt(1.0, "mean flow from the last keyframe, in grid cells", gt=0)
+    threshold: float = opt(1.25, "mean flow from the last keyframe, in grid cells", gt=0)
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
         0.3,
@@ -121,7 +121,7 @@ class FrontendConfig:
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     init_beta: float = opt(0.25, "the same during initialisation", ge=0, le=1)
     keyframe_threshold: float = opt(
-        0.6, "distance below which the newest keyframe is dropped", ge=0
+        0.8, "distance below which the newest keyframe is dropped", ge=0
     )
     threshold: float = opt(8.0, "largest frame distance of a proximity edge, in cells", gt=0)
     window: int = opt(25, "keyframes searched for proximity edges", ge=2)
@@ -216,7 +216,7 @@ class DroidwConfig:
     features: SlotConfig = field(default_factory=lambda: SlotConfig("cnn"))
     depth: SlotConfig = field(default_factory=lambda: SlotConfig("none"))
     uncertainty: SlotConfig = field(default_factory=lambda: SlotConfig("affine-softplus"))
-    ba: SlotConfig = field(default_factory=lambda: SlotConfig("torch"))
+    ba: SlotConfig = field(default_factory=lambda: SlotConfig("auto"))
     correspondence: SlotConfig = field(default_factory=lambda: SlotConfig("flow"))
     exporters: dict[str, Any] = opt(
         {"trajectory": {}, "ply": {}, "uncertainty": {}, "depth": {}},
