@@ -53,22 +53,27 @@ struct View {
 
 // Rows of one edge over a block of cells: sums to `lanes`, E to its buffer, C and w added up.
 template <class S, bool POSE, bool DEPTH>
-void edge_block(const View<S>& view, int64_t e, const Motion<S>& G, const S* d, int64_t first,
+void edge_block(const View<S>& view, int64_t e, const Motion<S> G, const S* d, int64_t first,
                 int64_t n, Pack<S>* lanes, S* E, S* C, S* w, Pack<S>& energy, Pack<S>& dropped) {
     using R = Pack<S>;
     const S *target = view.target(e) + 2 * first, *weight = view.weight(e) + 2 * first;
     const S *ray_x = view.work.ray_x.data() + first, *ray_y = view.work.ray_y.data() + first;
+    // copies that no store below can change, for all that the compiler knows
+    const Camera<S> K = view.K;
+    const S huber = view.huber;
+    const bool check = view.check;
+    R energies(S(0));
     for (int64_t at = 0; at < n; at += R::lanes) {
         R tu, tv, wu, wv;
         Reader<S>::pair(target + 2 * at, n - at, tu, tv);
         Reader<S>::pair(weight + 2 * at, n - at, wu, wv);
-        if (view.check) dropped += drop_nonfinite(tu, tv, wu, wv);
+        if (check) dropped += drop_nonfinite(tu, tv, wu, wv);
         const R here = R::load(d + at);
         const Seen<R> p = project(G, R::load(ray_x + at), R::load(ray_y + at), here);
-        const Measured<R> m = measure(view.K, p, p.ok, tu, tv, wu, wv, view.huber);
-        energy += m.energy;
+        const Measured<R> m = measure(K, p, p.ok, tu, tv, wu, wv, huber);
+        energies += m.energy;
         if (!POSE && !DEPTH) continue;
-        const Linear<R> l = linearise(view.K, G, p, m, here);
+        const Linear<R> l = linearise(K, G, p, m, here);
         if (DEPTH) {
             (R::load(C + at) + depth_curvature(l)).store(C + at);
             (R::load(w + at) + depth_gradient(l)).store(w + at);
@@ -76,10 +81,16 @@ void edge_block(const View<S>& view, int64_t e, const Motion<S>& G, const S* d, 
         if (POSE && DEPTH) {
             R row[6];
             coupling(l, row);
-            for (int k = 0; k < 6; ++k) row[k].store(E + k * PLANE + at);
+            row[0].store(E + at);
+            row[1].store(E + PLANE + at);
+            row[2].store(E + 2 * PLANE + at);
+            row[3].store(E + 3 * PLANE + at);
+            row[4].store(E + 4 * PLANE + at);
+            row[5].store(E + 5 * PLANE + at);
         }
         if (POSE) add_pose_sums(l, lanes);
     }
+    energy += energies;
 }
 
 // Rows r and r + 1 of E_a Q E_b^T from column `from` on. The twelve sums have names of their own,
@@ -103,6 +114,23 @@ void pair_rows(const S* Ea, const S* Eb, const S* Q, int64_t n, Pack<S>* lanes) 
     }
     lanes[0] = t0, lanes[1] = t1, lanes[2] = t2, lanes[3] = t3, lanes[4] = t4, lanes[5] = t5;
     lanes[6] = s0, lanes[7] = s1, lanes[8] = s2, lanes[9] = s3, lanes[10] = s4, lanes[11] = s5;
+}
+
+// E_a times a row of cells.
+template <class S>
+void row_sums(const S* Ea, const S* row, int64_t n, Pack<S>* lanes) {
+    using R = Pack<S>;
+    R s0 = lanes[0], s1 = lanes[1], s2 = lanes[2], s3 = lanes[3], s4 = lanes[4], s5 = lanes[5];
+    for (int64_t at = 0; at < n; at += R::lanes) {
+        const R right = R::load(row + at);
+        s0 += R::load(Ea + at) * right;
+        s1 += R::load(Ea + PLANE + at) * right;
+        s2 += R::load(Ea + 2 * PLANE + at) * right;
+        s3 += R::load(Ea + 3 * PLANE + at) * right;
+        s4 += R::load(Ea + 4 * PLANE + at) * right;
+        s5 += R::load(Ea + 5 * PLANE + at) * right;
+    }
+    lanes[0] = s0, lanes[1] = s1, lanes[2] = s2, lanes[3] = s3, lanes[4] = s4, lanes[5] = s5;
 }
 
 // The sums of a unit: poses of every active edge, E Q rhs, and E Q E^T of every pair of edges.
@@ -158,13 +186,7 @@ void linearise_unit(const View<S>& view, const Unit& unit, Scratch<S>& mine, Fou
         R* pair = lanes_pairs;
         for (int64_t a = 0; a < k; ++a) {
             const S* const Ea = mine.E.data() + a * 6 * PLANE;
-            R sums[6];
-            for (int c = 0; c < 6; ++c) sums[c] = lanes_rhs[6 * a + c];
-            for (int64_t at = 0; at < n; at += R::lanes) {
-                const R right = R::load(Qr + at);
-                for (int c = 0; c < 6; ++c) sums[c] += R::load(Ea + c * PLANE + at) * right;
-            }
-            for (int c = 0; c < 6; ++c) lanes_rhs[6 * a + c] = sums[c];
+            row_sums(Ea, Qr, n, lanes_rhs + 6 * a);
             pair_rows<S, 0>(Ea, Ea, Q, n, pair);
             pair_rows<S, 2>(Ea + 2 * PLANE, Ea, Q, n, pair + 12);
             pair_rows<S, 4>(Ea + 4 * PLANE, Ea, Q, n, pair + 24);
@@ -197,6 +219,8 @@ void substitute_unit(const View<S>& view, const Unit& unit, const double* steps)
     S d[BLOCK], sum[BLOCK];
     // without a robust kernel the residual has no share in E: its target need not be read
     const bool residuals = view.check || view.huber >= S(0);
+    const Camera<S> K = view.K;
+    const S huber = view.huber;
     for (int64_t first = unit.begin; first < unit.end; first += BLOCK) {
         const int64_t n = std::min<int64_t>(BLOCK, unit.end - first);
         S* const dz = work.rhs.data() + unit.source * cells + first;
@@ -223,8 +247,8 @@ void substitute_unit(const View<S>& view, const Unit& unit, const double* steps)
                 const Seen<R> p = project(
                     G, R::load(work.ray_x.data() + first + at),
                     R::load(work.ray_y.data() + first + at), here);
-                const Measured<R> m = measure(view.K, p, p.ok, tu, tv, wu, wv, view.huber);
-                const Linear<R> l = linearise(view.K, G, p, m, here);
+                const Measured<R> m = measure(K, p, p.ok, tu, tv, wu, wv, huber);
+                const Linear<R> l = linearise(K, G, p, m, here);
                 (R::load(sum + at) - coupled_step(l, y)).store(sum + at);
             }
         }

@@ -5,6 +5,10 @@
 
 #include "real.h"
 
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
 #if defined(__AVX512F__)
 #define DW_BYTES 64
 #elif defined(__AVX__)
@@ -36,7 +40,7 @@ struct Pack {
 
     Pack() = default;
     DW_HD Pack(V v_) : v(v_) {}
-    DW_HD Pack(S s) { v = V{} + s; }
+    DW_HD Pack(S s) { v = s - V{}; }  // s itself: nothing is left of the subtraction
     static DW_HD Pack load(const S* from) {
         Pack p;
         memcpy(&p.v, from, sizeof(V));
@@ -134,5 +138,21 @@ DW_HD void split_pairs(const S* from, Pack<S>& x, Pack<S>& y) {
     y.v = __builtin_shuffle(low.v, high.v, odd);
 #endif
 }
+
+#if defined(__AVX2__) && DW_BYTES == 32
+template <>
+DW_HD Pack<float> root<float>(Pack<float> x) {
+    return Pack<float>(_mm256_sqrt_ps(x.v));
+}
+
+// The compiler's own answer takes half as many instructions again.
+template <>
+DW_HD void split_pairs<float>(const float* from, Pack<float>& x, Pack<float>& y) {
+    const __m256 low = _mm256_loadu_ps(from), high = _mm256_loadu_ps(from + 8);
+    const __m256 even = _mm256_shuffle_ps(low, high, 0x88), odd = _mm256_shuffle_ps(low, high, 0xdd);
+    x.v = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(even), 0xd8));
+    y.v = _mm256_castpd_ps(_mm256_permute4x64_pd(_mm256_castps_pd(odd), 0xd8));
+}
+#endif
 
 }  // namespace dw
