@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from droidw.geometry.projective import NEAR, relative_pose, reproject
+from droidw.geometry import se3
+from droidw.geometry.projective import NEAR, pixel_grid, relative_pose, reproject
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.solve.problem import BAProblem
 from droidw.solve.weights import residual_weights
@@ -138,13 +139,11 @@ def carry_depth(disps: Tensor, T_cw: Tensor, intrinsics: Tensor) -> Tensor:
 
 def _relative_depth(T_cw: Tensor, disps: Tensor, intrinsics: Tensor) -> Tensor:
     """Z [h,w] of the cells of the first camera in the other (REFERENCE 2.1)."""
-    from droidw.geometry import se3
-    from droidw.geometry.projective import pixel_grid
-
     pair = torch.tensor([0, 1], device=disps.device)
     G = relative_pose(T_cw, pair[:1], pair[1:])
     row = se3.rotation(G)[0, 2].to(disps.dtype)
     fx, fy, cx, cy = intrinsics.unbind()
-    xy = pixel_grid(*disps.shape, disps.dtype, disps.device)
+    height, width = disps.shape
+    xy = pixel_grid(height, width, disps.dtype, disps.device)
     ray = row[0] * (xy[..., 0] - cx) / fx + row[1] * (xy[..., 1] - cy) / fy + row[2]
     return ray + G[0, 2].to(disps.dtype) * disps

@@ -73,6 +73,7 @@ def plugins():
         ("uncertainty", part("affine-softplus", LearnOptions, BOTH | {"features"})),
         ("uncertainty", part("mlp", OtherOptions, BOTH | {"features"})),
         ("uncertainty", part("none")),
+        ("ba", part("auto")),
         ("ba", part("torch")),
         ("ba", part("cuda", capabilities=frozenset({"cuda"}))),
         ("correspondence", part("flow", capabilities=frozenset({"cpu"}))),

@@ -58,7 +58,7 @@ def test_round_trip(resolved, tmp_path):
     assert [part.name for part, _ in second.exporters] == ["trajectory", "uncertainty", "depth"]
     assert second.to_yaml() == first.to_yaml()
     assert yaml.safe_load(first.to_yaml())["uncertainty"]["options"]["taps"] == [1, 2]
-    assert "# ba: torch, from registered from Python" in first.to_yaml()
+    assert "# ba: auto, from registered from Python" in first.to_yaml()
 
 
 PHASES = ", ".join(DroidwConfig().schedule)
@@ -69,7 +69,8 @@ PHASES = ", ".join(DroidwConfig().schedule)
     [
         ("camera.long_sid=3",
          "camera.long_sid: there is no such key\n  did you mean 'camera.long_side'?   "
-         "keys of camera: calib, focal, fov, long_side, size, edge"),
+         "keys of camera: calib, focal, fov, long_side, size, edge, refine_focal, "
+         "focal_trust, focal_range"),
         ("camera.long_side=big",
          "camera.long_side: 'big' is not valid here\n  expected: whole number"),
         ("camera.fov=200", "camera.fov: 200.0 is out of range\n  valid: > 1 and < 179"),
@@ -79,7 +80,7 @@ PHASES = ", ".join(DroidwConfig().schedule)
          "or [] to follow camera.long_side"),
         ("camera=3",
          "camera: 3 is not valid here\n  expected a section with keys: calib, focal, fov, "
-         "long_side, size, edge"),
+         "long_side, size, edge, refine_focal, focal_trust, focal_range"),
         ("weighting.gate=step",
          "weighting.gate: 'step' is not valid here\n  expected: one of rational, inverse, none"),
         ("backend.passes=[7, a]",

@@ -61,8 +61,9 @@ def bench(wrong: float):
     given = true * torch.tensor([wrong, wrong, 1.0, 1.0])
     store = KeyframeStore(grid, given)
     s = torch.linspace(0, 1, count)
-    path = (0.8 * (5 * s).sin(), 0.3 * (7 * s).cos(), 0.2 * s, 0.2 * s.cos(), 0.5 * (4 * s).sin(), s)
-    T_cw = se3.exp(torch.stack(path, 1) * torch.tensor([1.0, 1, 1, 1, 1, 0.1]))
+    across = (0.8 * (5 * s).sin(), 0.3 * (7 * s).cos(), 0.2 * s)
+    turn = (0.2 * s.cos(), 0.5 * (4 * s).sin(), 0.1 * s)
+    T_cw = se3.exp(torch.stack((*across, *turn), 1))
     x, y = projective.pixel_grid(h, w).unbind(-1)
     disps = torch.stack([0.6 + 0.2 * (0.6 * x + k).sin() + 0.1 * y.cos() for k in range(count)])
     for k in range(count):

@@ -74,8 +74,8 @@ class Track:
         gap = current.index - self.current
         if not 0 < gap <= _LONGEST_GAP:
             return None
+        going_on: Array = self.velocity * np.float32(gap)
         if reference.index == self.reference:
-            return self.flow + self.velocity * np.float32(gap)
-        if reference.index == self.current:
-            return self.velocity * np.float32(gap)
-        return None
+            going_on += self.flow
+            return going_on
+        return going_on if reference.index == self.current else None
