@@ -33,9 +33,6 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 SERIAL = (
     "start",
-    "encode",
-    "motion filter",
-    "features",
     "depth prior",
     "frontend",
     "global",
@@ -45,7 +42,7 @@ SERIAL = (
 )
 """Stages that follow each other in one thread; what they leave of the run is `between`."""
 
-BESIDE = ("decode",)
+BESIDE = ("decode", "encode", "motion filter", "features")
 """Stages of other threads, which take time from nobody who does not wait for them."""
 
 LIMITS: Mapping[str, float] = {

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from droidw.interfaces.correspondence import Motion
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from droidw.config.schema import MotionFilterConfig
     from droidw.interfaces.correspondence import Correspondence
     from droidw.slam.frame import Frame
@@ -22,10 +24,11 @@ __all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead"]
 
 @dataclass(frozen=True)
 class Encoded:
-    """A frame and what correspondence made of it."""
+    """A frame, what correspondence made of it, and its features where they are known already."""
 
     frame: Frame
     payload: Any
+    features: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,14 @@ class SlamSystem:
     def _judge(self, frame: Frame) -> tuple[Encoded, Verdict]:
         current = self._encode(frame)
         with self.clock("motion filter"):
-            return current, self._filter.judge(current)
+            verdict = self._filter.judge(current)
+        if verdict.keep and self._pool is not None:
+            current = replace(current, features=self._features(frame))
+        return current, verdict
+
+    def _features(self, frame: Frame) -> Tensor:
+        with self.clock("features"):
+            return self.parts.features.extract(frame.image.to(self.store.device), self._picked)
 
     def _encode(self, frame: Frame) -> Encoded:
         with self.clock("encode"):
@@ -182,10 +189,8 @@ class SlamSystem:
 
     def _append(self, current: Encoded) -> int:
         frame, parts, store = current.frame, self.parts, self.store
-        image = frame.image.to(store.device)
         pose, disp = self.frontend.guess(frame.time)
-        with self.clock("features"):
-            features = parts.features.extract(image, self._picked)
+        features = self._features(frame) if current.features is None else current.features
         with self.clock("depth prior"):
             prior = self._prior(frame)
         payload = parts.correspondence.context(current.payload, frame, self.grid)

@@ -44,6 +44,7 @@ class FlowCorrespondence:
         self.stride = options.stride
         self.offset = (options.stride - 1) / 2
         self._track: Track | None = None
+        self._placed: tuple[tuple[int, int], Any, Any] | None = None
         workers = options.workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
         self._local = threading.local()
@@ -54,7 +55,7 @@ class FlowCorrespondence:
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
         """Grey image and texture at the cells."""
-        rgb = frame.image.permute(1, 2, 0).numpy()
+        rgb = cv2.merge(list(frame.image.numpy()))
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         centres = grid.centres().numpy().astype(np.float32)
         window = (2 * self.stride - 1, 2 * self.stride - 1)
@@ -230,9 +231,7 @@ class FlowCorrespondence:
         """Grid targets [h,w,2] in cells as a full flow field [H,W,2] in pixels."""
         flow = target * self.stride + self.offset - a.centres
         height, width = a.grey.shape
-        rows = np.float32(np.clip((np.arange(height) - self.offset) / self.stride, 0, None))
-        cols = np.float32(np.clip((np.arange(width) - self.offset) / self.stride, 0, None))
-        map_x, map_y = np.meshgrid(cols, rows)
+        map_x, map_y = self._maps(height, width)
         dense = cv2.remap(
             np.ascontiguousarray(flow, dtype=np.float32),
             map_x,
@@ -242,6 +241,14 @@ class FlowCorrespondence:
         )
         bounded: Array = np.clip(dense, -2.0 * width, 2.0 * width).astype(np.float32)
         return bounded
+
+    def _maps(self, height: int, width: int) -> tuple[Any, Any]:
+        """Where every pixel lies on the grid, in the form that `cv2.remap` likes best."""
+        if self._placed is None or self._placed[0] != (height, width):
+            rows = np.float32(np.clip((np.arange(height) - self.offset) / self.stride, 0, None))
+            cols = np.float32(np.clip((np.arange(width) - self.offset) / self.stride, 0, None))
+            self._placed = ((height, width), *np.meshgrid(cols, rows))
+        return self._placed[1], self._placed[2]
 
     def _checked(self, a: FlowFrame, ab: Array, ba: Array, started: Array | None) -> Edge:
         moved = _at(ab, a.centres)
