@@ -230,6 +230,14 @@ def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
             f"{loaded.at('camera.size')}: {size} is not a working size",
             "valid: [width, height], each at least 16, or [] to follow camera.long_side",
         )
+    said = [key for key in ("calib", "focal", "fov") if getattr(config.camera, key) is not None]
+    if len(said) > 1:
+        raise ConfigError(
+            f"{loaded.at('camera.' + said[-1])}: {' and '.join(said)} are given, but only one of "
+            "them can hold",
+            "give one of --calib FILE, --focal PIXELS, --fov DEGREES; one that a file sets is off "
+            f"with camera.{said[0]}=null",
+        )
     phases = list(DroidwConfig().schedule)
     for phase in config.schedule:
         if phase not in phases:

@@ -25,11 +25,10 @@ def choose_camera(
 ) -> tuple[Camera, str, bool]:
     """The camera of the raw pictures.
 
-    A calibration file comes before a focal length, that before a field of view, that before
-    what the source says, and a guess comes last.
+    What the user said comes before what the source says, and a guess comes last.
 
     Args:
-        config: what the user said.
+        config: what the user said; at most one of a file, a focal length, a field of view.
         known: what the source says.
         width, height: of the raw pictures.
         source: name of the source, for messages.
@@ -38,12 +37,6 @@ def choose_camera(
     Raises:
         InputError: a calibration cannot be used, or does not fit the pictures.
     """
-    given = [name for name in ("calib", "focal", "fov") if getattr(config, name) is not None]
-    if len(given) > 1:
-        raise InputError(
-            f"camera: {' and '.join(given)} are given, but only one of them can hold",
-            "give one of --calib FILE, --focal PIXELS, --fov DEGREES",
-        )
     if config.calib is not None:
         camera, note = read_calibration(Path(config.calib), width, height)
         return camera, f"from {config.calib}{': ' + note if note else ''}", False

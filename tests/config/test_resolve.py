@@ -75,6 +75,10 @@ PHASES = ", ".join(DroidwConfig().schedule)
          "camera.long_side: 'big' is not valid here\n  expected: whole number"),
         ("camera.fov=200", "camera.fov: 200.0 is out of range\n  valid: > 1 and < 179"),
         ("camera.fov=.nan", "camera.fov: nan is not a finite number\n  valid: > 1 and < 179"),
+        ("camera={calib: a.txt, fov: 60}",
+         "camera.fov: calib and fov are given, but only one of them can hold\n  give one of "
+         "--calib FILE, --focal PIXELS, --fov DEGREES; one that a file sets is off with "
+         "camera.calib=null"),
         ("camera.size=[3]",
          "camera.size: [3] is not a working size\n  valid: [width, height], each at least 16, "
          "or [] to follow camera.long_side"),

@@ -53,8 +53,9 @@ def test_impossible_is_refused(go, footage, tmp_path, text, words, place):
 
 def test_two_at_once_are_refused(go, footage):
     ran = go(footage(count=3).folder, "--focal", "100", "--fov", "60")
-    assert ran.code == 3
+    assert ran.code == 2
     assert "focal and fov are given" in ran.err
+    assert not ran.folder.exists()
 
 
 def test_missing_file(go, footage, tmp_path):
