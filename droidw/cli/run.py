@@ -104,7 +104,8 @@ def main(args: argparse.Namespace) -> int:
         values=values,
         overwrite=args.overwrite,
     )
-    print(summary(result))
+    if not args.quiet:
+        print(summary(result))
     return 0
 
 
@@ -165,10 +166,13 @@ def _fresh(source: str) -> Path:
 def summary(result: RunResult) -> str:
     """What a run came to, and where its files are."""
     facts = result.manifest
-    lines = [
-        f"{facts['frames']} frames, {facts['keyframes']} keyframes, {facts['fps']:.1f} frames/s, "
-        f"{len(result.cloud.xyz)} points, scale {facts['scale']}"
-    ]
+    counts = {
+        "frame": facts["frames"],
+        "keyframe": facts["keyframes"],
+        "point": len(result.cloud.xyz),
+    }
+    told = [f"{count} {noun}{'s' * (count != 1)}" for noun, count in counts.items()]
+    lines = [f"{', '.join(told)}, {facts['fps']:.1f} frames/s, scale {facts['scale']}"]
     width = max((len(name) for name in facts["files"]), default=0)
     for name, meaning in facts["files"].items():
         lines.append(f"  {result.run_dir}/{name:<{width}}  {meaning}")

@@ -49,10 +49,16 @@ def run(tmp_path, capsys):
 def test_it_runs_and_says_where_the_files_are(run):
     code, said, wrong, out = run("synthetic:static")
     assert code == 0, wrong
-    assert said.startswith("4 frames, 1 keyframes, ")
+    assert said.startswith("4 frames, 1 keyframe, ")
     assert "scale arbitrary" in said
     assert f"{out}/trajectory.tum" in said
     assert len((out / "trajectory.tum").read_text().splitlines()) == 5
+
+
+def test_quiet_says_nothing(run):
+    code, said, wrong, out = run("synthetic:static", "-q", "input.max_frames=2")
+    assert (code, said, wrong) == (0, "", "")
+    assert (out / "trajectory.tum").exists()
 
 
 def test_flags_are_other_spellings_of_keys(run):
