@@ -21,7 +21,7 @@ from droidw.errors import PluginError, UsageError
 from droidw.plugin import hookspecs
 from droidw.plugin.checks import HOOKS, checked_components, explained, import_file, problem_of
 from droidw.plugin.component import Component
-from droidw.plugin.registry import KINDS, Entry, Failure, Registry, nearest
+from droidw.plugin.registry import FROM_PYTHON, KINDS, Entry, Failure, Registry, nearest
 
 if TYPE_CHECKING:
     from importlib import metadata
@@ -109,7 +109,7 @@ class Plugins:
             PluginError: it breaks a contract, or its name is taken; nothing of it is kept.
         """
         label = name or getattr(plugin, "__name__", None) or type(plugin).__name__
-        failure = self._register(plugin, _Origin(str(label), "registered from Python", ""))
+        failure = self._register(plugin, _Origin(str(label), FROM_PYTHON, ""))
         if failure is not None:
             raise _raised(failure)
 
@@ -121,7 +121,7 @@ class Plugins:
             PluginError: the component breaks a contract.
         """
         self.registry(kind)
-        origin = _Origin(getattr(component, "name", "?"), "registered from Python", "")
+        origin = _Origin(getattr(component, "name", "?"), FROM_PYTHON, "")
         problem = problem_of(component)
         if problem:
             raise PluginError(f"a component of kind '{kind}' {problem}")
@@ -325,7 +325,7 @@ def _full_name(entry: Entry) -> str:
 def _raised(failure: Failure) -> PluginError:
     return PluginError(
         f"plugin '{failure.name}' ({failure.origin}) failed to load: {failure.error}",
-        failure.traceback and f"see: droidw list-plugins --traceback {failure.name}",
+        failure.hint,
     )
 
 

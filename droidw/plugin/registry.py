@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import util
@@ -15,6 +16,7 @@ from droidw.plugin.weights import find_weights, weights_name
 
 __all__ = [
     "FETCH",
+    "FROM_PYTHON",
     "KINDS",
     "SLOTS",
     "Entry",
@@ -59,14 +61,27 @@ KINDS: Mapping[str, Kind] = {
 FETCH = "download them: droidw weights fetch "
 """How the line of a hint begins that says how to get weights that are missing."""
 
+FROM_PYTHON = "registered from Python"
+"""Stands for the distribution of what a program brought along itself."""
+
 SLOTS: tuple[str, ...] = ("features", "depth", "uncertainty", "ba", "correspondence", "reader")
 """Kinds of which a run has exactly one; the key in the configuration is the name of the kind."""
 
 
 def nearest(name: str, valid: Collection[str]) -> str:
-    """The valid name most like `name`, or "" if none is near."""
-    close = difflib.get_close_matches(name, list(valid), n=1, cutoff=0.6)
-    return close[0] if close else ""
+    """The valid name most like `name`, or "" if none is near.
+
+    A name that goes on where the other ends (`affine`, `affine-softplus`) is near as well, but not
+    as near as one with a slip in it.
+    """
+    names = list(valid)
+    begun = [v for v in names if len(name) > 1 and v.startswith(name)]
+    begun += [v for v in names if len(v) > 2 and name.startswith(v)]
+    for among, cutoff in ((names, 0.8), (begun, 0.0), (names, 0.65)):
+        close = difflib.get_close_matches(name, among, n=1, cutoff=cutoff)
+        if close:
+            return close[0]
+    return ""
 
 
 @dataclass(frozen=True)
@@ -113,6 +128,15 @@ class Failure:
     def origin(self) -> str:
         """Distribution and version, e.g. "droidw-acme 1.2"."""
         return f"{self.distribution} {self.version}".strip()
+
+    @property
+    def hint(self) -> str:
+        """What to type to see the traceback; "" where there is none, or no command can show it."""
+        if not self.traceback or self.distribution == FROM_PYTHON:
+            return ""
+        from_file = not self.version and Path(self.distribution).is_file()
+        file = f"--plugin {shlex.quote(self.distribution)} " if from_file else ""
+        return f"see: droidw list-plugins {file}--traceback {shlex.quote(self.name)}"
 
 
 @dataclass(frozen=True)
@@ -271,7 +295,7 @@ class Registry:
             if failure.name == name:
                 return PluginError(
                     f"plugin '{name}' of {failure.origin} failed to load: {failure.error}",
-                    f"see: droidw list-plugins --traceback {name}",
+                    failure.hint,
                 )
         near = nearest(name, self.names())
         hint = (f"did you mean '{near}'?   " if near else "") + f"available: {self._available()}"

@@ -101,6 +101,13 @@ def test_json(run, acme):
     assert json.loads(run("--json", "--options", "acme"))[0]["name"] == "acme"
 
 
+def test_traceback_of_a_file(run, tmp_path):
+    path = tmp_path / "bad.py"
+    path.write_text("1 / 0")
+    assert main(["run", "clip.mp4", "--plugin", str(path)]) == 5
+    assert "Traceback (most recent call last)" in run("--plugin", str(path), "--traceback", "bad")
+
+
 def test_traceback(run, acme):
     assert "acme_import_error.py" in run("--traceback", "acme-depth")
     assert "no plugin called 'cnn' failed to load" in run("--traceback", "cnn", code=2)

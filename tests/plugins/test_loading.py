@@ -11,7 +11,7 @@ import pytest
 
 import droidw
 from droidw.errors import MissingRequirementError, PluginError, UsageError
-from droidw.plugin.registry import KINDS, PluginNotFound
+from droidw.plugin.registry import KINDS, PluginNotFound, nearest
 
 SOUND = """
 from __future__ import annotations
@@ -196,6 +196,17 @@ def test_unknown_name_gets_the_nearest_and_the_list():
     assert caught.value.exit_code == 5
 
 
+def test_only_what_is_really_near_is_suggested():
+    kinds = {kind: droidw.load_plugins(environ={}).registry(kind).names() for kind in KINDS}
+    for kind, name, near in (
+        ("depth", "affine", ""), ("uncertainty", "affine", "affine-softplus"),
+        ("uncertainty", "afine-softplus", "affine-softplus"), ("uncertainty", "pixel", "per-pixel"),
+        ("features", "dino", "dinov2"), ("depth", "metric3d-large", "metric3d"),
+        ("exporter", "plx", "ply"), ("reader", "file", ""), ("ba", "nothing", ""),
+    ):  # fmt: skip
+        assert nearest(name, kinds[kind]) == near, (kind, name)
+
+
 def test_unknown_kind():
     with pytest.raises(UsageError, match="there is no kind of plugin called 'feature'"):
         droidw.load_plugins(environ={}).registry("feature")
@@ -213,8 +224,9 @@ def test_file_plugin_that_is_broken_was_asked_for(tmp_path):
     path = tmp_path / "bad.py"
     path.write_text("1 / 0")
     before = set(sys.modules)
-    with pytest.raises(PluginError, match=r"'bad' .* failed to load: ZeroDivisionError"):
+    with pytest.raises(PluginError, match=r"'bad' .* failed to load: ZeroDivisionError") as caught:
         droidw.load_plugins([path], environ={})
+    assert caught.value.hint == f"see: droidw list-plugins --plugin {path} --traceback bad"
     assert not [name for name in set(sys.modules) - before if "droidw_plugin" in name]
     assert failure(droidw.load_plugins([path], environ={}, tolerant=True), "bad").traceback
     with pytest.raises(UsageError, match="there is no such file"):
