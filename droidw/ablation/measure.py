@@ -45,7 +45,7 @@ def measure_run(run_dir: Path, how: Measuring) -> dict[str, Any]:
             masks_after=how.masks_after,
         )
         record = found.to_dict()
-        curve = _curve(found.frames)
+        curve = {} if found.frames is None else _curve(found.frames)
     except (UsageError, InputError) as error:
         notes.append(error.message)
         record = _masks(run_dir, how, notes)

@@ -55,9 +55,9 @@ def main(args: argparse.Namespace) -> int:
     )
     print(summary(result))
     scores = evaluate(run_dir, footage / "groundtruth.txt")
-    ate = scores.frames.to_dict()
+    ate = scores.to_dict()
     print(
-        f"ATE {ate['ate_rmse']:.4f} {scores.frames.unit} RMSE over {ate['matched']} of "
+        f"ATE {ate['ate_rmse']:.4f} {ate['unit']} RMSE over {ate['matched']} of "
         f"{ate['frames']} frames after Sim(3), path {ate['path_length']:.2f} m"
     )
     if scores.masks is not None:

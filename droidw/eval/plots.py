@@ -24,8 +24,14 @@ def write_plots(evaluation: Evaluation, folder: Path) -> list[Path]:
     Returns:
         The files.
     Raises:
-        UsageError: the folder cannot be made or written to.
+        UsageError: there are no poses to draw, or the folder cannot be made or written to.
     """
+    frames = evaluation.frames
+    if frames is None:
+        raise UsageError(
+            "--plot draws errors of poses, and no true poses are known",
+            "give a reference: --ref FILE (TUM: t tx ty tz qx qy qz qw)",
+        )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -33,8 +39,10 @@ def write_plots(evaluation: Evaluation, folder: Path) -> list[Path]:
             f"--plot: cannot make the folder {folder}: {error.strerror or error}",
             "give another folder: --plot DIR",
         ) from error
-    frames = evaluation.frames
-    pictures = {"trajectory.svg": _paths(frames), "ate.svg": _errors(evaluation)}
+    pictures = {
+        "trajectory.svg": _paths(frames),
+        "ate.svg": _errors(frames, evaluation.keyframes),
+    }
     if len(frames.rpe_times):
         pictures["rpe.svg"] = _relative(frames)
     written = []
@@ -57,8 +65,7 @@ def _paths(score: TrajectoryScore) -> str:
     )
 
 
-def _errors(evaluation: Evaluation) -> str:
-    score, keys = evaluation.frames, evaluation.keyframes
+def _errors(score: TrajectoryScore, keys: TrajectoryScore | None) -> str:
     begin = float(score.times[0])
     lines = [Line("all frames", score.times - begin, score.errors, colour(0))]
     if keys is not None:

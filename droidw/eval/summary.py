@@ -35,20 +35,21 @@ class Evaluation:
     """All figures of one run.
 
     Attributes:
-        frames: every frame's pose (`trajectory.tum`, or the file that was given).
+        frames: every frame's pose (`trajectory.tum`, or the file that was given), or None where
+            no true poses are known and only masks are scored.
         keyframes: the same for `keyframes.tum`, or None where there is none.
         masks: the score of the uncertainty maps, or None without maps or masks.
         notes: sentences about what was left out.
     """
 
-    frames: TrajectoryScore
+    frames: TrajectoryScore | None
     keyframes: TrajectoryScore | None = None
     masks: MaskScore | None = None
     notes: tuple[str, ...] = field(default=())
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: the figures of all frames at the top, `keyframes` and `masks` below."""
-        record = self.frames.to_dict()
+        record = {"notes": []} if self.frames is None else self.frames.to_dict()
         record["notes"] = [*record["notes"], *self.notes]
         if self.keyframes is not None:
             record["keyframes"] = self.keyframes.to_dict()
@@ -80,7 +81,7 @@ def evaluate(
         masks: folder of masks, or None to look for `mask/` in the source of the run.
         masks_after: leave so many keyframes at the start out of the score of the masks.
     Raises:
-        UsageError: if no reference is given and none can be found.
+        UsageError: if no reference is given and none can be found, and no masks either.
         InputError: if a file is missing, is no trajectory or does not match.
     """
     run_dir = path if path.is_dir() else None
@@ -91,8 +92,16 @@ def evaluate(
             "give a run folder that holds trajectory.tum, or a TUM file (t tx ty tz qx qy qz qw)",
         )
     source = source_of(run_dir) if run_dir else None
+    found = mask_score(run_dir, source, masks, masks_after)
+    reference = reference or _known_reference(run_dir, source)
+    if reference is None and found is not None:
+        return Evaluation(None, masks=found, notes=(f"only masks are scored: {_NO_REFERENCE}",))
     if reference is None:
-        reference = _reference(run_dir, source)
+        raise UsageError(
+            f"nothing to compare with: {_NO_REFERENCE}",
+            "give one: --ref FILE (TUM: t tx ty tz qx qy qz qw) or --ref FOLDER (with "
+            "groundtruth.txt), or masks of what moves: --masks DIR",
+        )
     ref_file = reference_file(reference)
     truth = _File.read(ref_file)
     options: dict[str, Any] = {
@@ -113,7 +122,6 @@ def evaluate(
         except InputError as error:
             # A clip with two keyframes has a trajectory worth scoring all the same.
             notes.append(f"keyframes are not scored: {error.message}")
-    found = mask_score(run_dir, source, masks, masks_after)
     return Evaluation(frames, keyframes, found, tuple(notes))
 
 
@@ -151,16 +159,18 @@ def _score_file(est: _File, ref: _File, options: dict[str, Any]) -> TrajectorySc
     )
 
 
-def _reference(run_dir: Path | None, source: Path | None) -> Path:
+_NO_REFERENCE = (
+    "no reference was given, and the run has no truth.tum and does not name a source with a "
+    "groundtruth.txt"
+)
+
+
+def _known_reference(run_dir: Path | None, source: Path | None) -> Path | None:
     if run_dir is not None and (run_dir / "truth.tum").is_file():
         return run_dir / "truth.tum"
     if source is not None and (source / "groundtruth.txt").is_file():
         return source
-    raise UsageError(
-        "nothing to compare with: no reference was given, and the run has no truth.tum and does "
-        "not name a source with a groundtruth.txt",
-        "give one: --ref FILE (TUM: t tx ty tz qx qy qz qw) or --ref FOLDER (with groundtruth.txt)",
-    )
+    return None
 
 
 def mask_score(

@@ -2,17 +2,41 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from droidw.eval.summary import Evaluation
+
+if TYPE_CHECKING:
+    from droidw.eval.metrics import TrajectoryScore
 
 __all__ = ["table"]
 
 
 def table(evaluation: Evaluation) -> str:
     """The figures as text for a terminal, with the story behind them."""
-    columns = [("all frames", evaluation.frames)]
+    columns = []
+    if evaluation.frames is not None:
+        columns.append(("all frames", evaluation.frames))
     if evaluation.keyframes is not None:
         columns.append(("keyframes", evaluation.keyframes))
-    first = evaluation.frames
+    lines = _trajectory(columns) if columns else []
+    masks = evaluation.masks
+    if masks is not None:
+        lines.append(
+            f"  motion masks, {masks.frames} frames, {100 * masks.moving:.1f} % moving:"
+            f" AUC {_number(masks.auc)}  best F1 {_number(masks.f1)}  IoU {_number(masks.iou)}"
+        )
+    notes = [*evaluation.notes]
+    for _, scored in columns:
+        notes += scored.notes
+    notes += masks.notes if masks is not None else ()
+    lines += [f"  note: {note}" for note in dict.fromkeys(notes)]
+    return "\n".join(lines)
+
+
+def _trajectory(columns: list[tuple[str, TrajectoryScore]]) -> list[str]:
+    """Lines of the figures of poses, a column each."""
+    first = columns[0][1]
     unit = first.unit
     rows: list[tuple[str, list[str]]] = [("", [name for name, _ in columns])]
 
@@ -51,18 +75,7 @@ def table(evaluation: Evaluation) -> str:
             f"  all lengths are divided by the reference's {what[first.normalise]}, so that "
             "the unit of the reference does not matter"
         )
-    masks = evaluation.masks
-    if masks is not None:
-        lines.append(
-            f"  motion masks, {masks.frames} frames, {100 * masks.moving:.1f} % moving:"
-            f" AUC {_number(masks.auc)}  best F1 {_number(masks.f1)}  IoU {_number(masks.iou)}"
-        )
-    notes = [*evaluation.notes]
-    for _, scored in columns:
-        notes += scored.notes
-    notes += masks.notes if masks is not None else ()
-    lines += [f"  note: {note}" for note in dict.fromkeys(notes)]
-    return "\n".join(lines)
+    return lines
 
 
 def _percent(value: float | None) -> str:

@@ -150,6 +150,22 @@ def test_bad_rows_are_left_out_and_told(
     assert any("groundtruth.txt, line 6" in note for note in record["notes"])
 
 
+@pytest.mark.parametrize("named", [True, False], ids=["--masks", "mask/ of the source"])
+def test_masks_alone(places: tuple[Path, Path], named: bool, capsys: pytest.CaptureFixture) -> None:
+    run, source = places
+    (source / "groundtruth.txt").unlink()
+    given = ["--masks", source / "mask"] if named else []
+    assert run_eval(run, *given, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert set(record) == {"masks", "notes"}
+    assert record["masks"]["auc"] == 1.0 and record["masks"]["frames"] == 2
+    assert any("only masks are scored" in note for note in record["notes"])
+    assert run_eval(run, *given, "--save") == 0
+    assert "AUC 1.000" in capsys.readouterr().out
+    assert json.loads((run / "metrics.json").read_text()) == record
+    assert "no true poses are known" in str(refusal(run, *given, "--plot", run / "plots"))
+
+
 def refusal(*words: object) -> DroidwError:
     with pytest.raises(DroidwError) as caught:
         run_eval(*words)
