@@ -105,6 +105,11 @@ def test_plugin_from_a_file(run, tmp_path):
         (["synthetic", "input.stride=0"], 2, ["input.stride"]),
         (["synthetic", "--stride", "-1"], 2, ["input.stride"]),
         (["synthetic", "features=cn"], 5, ["'cn'", "cnn"]),
+        (
+            ["synthetic:nowhere", "uncertainty=affine-softplus"],
+            2,
+            ["'affine-softplus' needs features", "features=NAME", "uncertainty=none"],
+        ),
         (["synthetic", "exporters.plyy={}"], 5, ["plyy", "ply"]),
         (["synthetic", "--preset", "cpuu"], 2, ["cpuu", "cpu"]),
         (["synthetic", "--config", "nowhere.yaml"], 2, ["nowhere.yaml"]),
