@@ -186,7 +186,7 @@ class WeightingConfig:
     bidirectional: bool = opt(False, "also weigh by the gate sampled in the target frame")
     confidence_scale: float = opt(1.0, "factor on the confidence of correspondence", gt=0)
     damping_scale: float = opt(0.2, "factor on the learned depth damping", ge=0)
-    damping_floor: float = opt(1e-7, "added to the depth damping", ge=0)
+    damping_floor: float = opt(0.1, "added to the depth damping", ge=0)
     prior_weight: float = opt(0.001, "gamma_d, weight of the depth prior", ge=0)
     min_disp: float = opt(1e-3, "smallest disparity", gt=0)
     max_disp: float = opt(0.0, "largest disparity (0: unbounded)", ge=0)

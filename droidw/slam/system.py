@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["Outcome", "SlamSystem"]
 
 # Frames that are encoded and judged ahead of the one being tracked.
-_LOOK_AHEAD = 6
+_LOOK_AHEAD = 32
 
 
 @dataclass(frozen=True)
@@ -250,7 +250,8 @@ class SlamSystem:
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
         if not found.still:
-            found = replace(found, parallax=parallax(self.store))
+            share = parallax(self.store, self.optimiser.gates())
+            found = replace(found, parallax=share, points=len(cloud.xyz))
         return Outcome(trajectory, records, cloud, found)
 
     def _refined(self, focal: FocalSearch | None) -> None:

@@ -31,7 +31,7 @@ class FlowOptions:
         default=8, metadata={"help": "side of the patches of the search, pixels", "ge": 4, "le": 32}
     )
     patch_stride: int = field(
-        default=4, metadata={"help": "pixels between the patches of the search", "ge": 1, "le": 8}
+        default=5, metadata={"help": "pixels between the patches of the search", "ge": 1, "le": 8}
     )
     refinement: int = field(
         default=3, metadata={"help": "variational refinement iterations", "ge": 0, "le": 20}
