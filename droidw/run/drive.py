@@ -299,7 +299,8 @@ class _Run:
         metrics = self._score_masks(metrics)
         if metrics is not None:
             write_json(self.run_dir / "metrics.json", metrics)
-        manifest = self._manifest(system, source, outcome)
+        # Exporters take time and write files; all else holds.
+        manifest = {**result.manifest, **self._facts_of_time(system, outcome), **self._files()}
         result = replace(result, manifest=manifest, warnings=tuple(warnings.warnings))
         write_json(self.run_dir / "manifest.json", {**manifest, "warnings": warnings.warnings})
         self.events.emit(RunFinished(result, self.run_dir, metrics))
@@ -328,22 +329,31 @@ class _Run:
     def _manifest(
         self, system: SlamSystem, source: FrameSource, outcome: Outcome
     ) -> dict[str, Any]:
+        return {
+            "source": self.config.input.source,
+            **facts_of_tracking(system, source, outcome),
+            **self._facts_of_time(system, outcome),
+            "camera": self.said,
+            **facts_of_setup(self.resolved, self.device, self.context.weights_dir, system.parts),
+            "note": self.note,
+            **self._files(),
+        }
+
+    def _facts_of_time(self, system: SlamSystem, outcome: Outcome) -> dict[str, Any]:
+        return facts_of_time(
+            system,
+            len(outcome.trajectory),
+            self.built - self.started,
+            time.perf_counter() - self.started,
+        )
+
+    def _files(self) -> dict[str, Any]:
+        """What lies in the run folder, and what each file means."""
         # written after the manifest has been put together
         later = {"manifest.json"}
         if any(part.name == "report" for part, _ in self.resolved.observers):
             later.add("report.html")
         return {
-            "source": self.config.input.source,
-            **facts_of_tracking(system, source, outcome),
-            **facts_of_time(
-                system,
-                len(outcome.trajectory),
-                self.built - self.started,
-                time.perf_counter() - self.started,
-            ),
-            "camera": self.said,
-            **facts_of_setup(self.resolved, self.device, self.context.weights_dir, system.parts),
-            "note": self.note,
             "files": {
                 name: meaning
                 for name, meaning in FILES.items()

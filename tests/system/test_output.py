@@ -52,6 +52,20 @@ def test_what_a_run_leaves(go, footage):
         assert name in ran.out
 
 
+def test_the_manifest_is_put_together_once(go, footage, monkeypatch):
+    from droidw.run import drive
+
+    described, calls = drive.facts_of_setup, []
+    monkeypatch.setattr(
+        drive, "facts_of_setup", lambda *given: calls.append(given) or described(*given)
+    )
+    ran = go(footage(count=3).folder)
+    assert ran.code == 0, ran.err
+    assert len(calls) == 1
+    # what only the end of a run knows is in it all the same
+    assert "export" in ran.manifest["stages"] and "points.ply" in ran.manifest["files"]
+
+
 def test_files_that_are_not_there_are_not_announced(go, footage):
     ran = go(footage(count=3).folder, "exporters.ply=null")
     held = {path.name for path in ran.folder.iterdir()}
