@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--preset",
         default=None,
         help="cpu, paper, droid-slam, or auto: paper where its parts and weights are there, else "
-        "cpu (default: auto, or what --config says)",
+        "cpu (default: auto, unless a --config file extends a preset or sets every section)",
     )
     parser.add_argument("--calib", metavar="FILE", help="calibration of the raw pictures")
     parser.add_argument("--focal", metavar="PX", help="focal length in pixels of the raw pictures")
@@ -119,12 +119,15 @@ def execute(
     values: Mapping[str, Any] | None = None,
     overwrite: bool = False,
 ) -> RunResult:
-    """Resolve a configuration and run it; `run_dir` None means a new folder below runs/."""
+    """Resolve a configuration and run it; `run_dir` None means a new folder below runs/.
+
+    Without a preset, files that are only changes are put on the preset `auto`, as overrides are.
+    """
     from droidw.config.load import load_config
-    from droidw.config.resolve import choose_preset, resolve
+    from droidw.config.resolve import choose_preset, needs_preset, resolve
 
     note = ""
-    if preset == "auto" or (preset is None and not files):
+    if preset == "auto" or (preset is None and needs_preset(files)):
         preset, note = choose_preset(plugins)
     resolved = resolve(load_config(files, preset, overrides, values), plugins)
     source = resolved.config.input.source

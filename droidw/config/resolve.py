@@ -10,20 +10,20 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import yaml
 
 from droidw.config.check import check_keys, check_ranges, typed
-from droidw.config.load import LISTED, LoadedConfig, Source, load_config
+from droidw.config.load import LISTED, LoadedConfig, Source, load_config, packaged_configs
 from droidw.config.schema import DroidwConfig
 from droidw.errors import ConfigError, DroidwError, MissingRequirementError, PluginError
 from droidw.plugin.component import Component
 from droidw.plugin.manager import Plugins
 from droidw.plugin.registry import FETCH, SLOTS, Entry, PluginNotFound, nearest
 
-__all__ = ["COMPAT", "ResolvedConfig", "choose_preset", "resolve"]
+__all__ = ["COMPAT", "ResolvedConfig", "choose_preset", "needs_preset", "resolve"]
 
 COMPAT = ("droid-w",)
 """Published behaviours that `compat` may ask for."""
@@ -148,6 +148,22 @@ def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
         loaded.preset,
         origins,
     )
+
+
+def needs_preset(files: Sequence[str | Path]) -> bool:
+    """Whether configuration files are only changes, which mean little without a preset below them.
+
+    Those that are or extend a preset, or set every section, as the `config.yaml` of a run does,
+    say all by themselves. No files need one, too.
+
+    Raises:
+        ConfigError: as `load_config`.
+    """
+    loaded = load_config(files)
+    presets = {p.resolve() for n, p in packaged_configs().items() if n.startswith("presets/")}
+    sections = {key.partition(".")[0] for key in loaded.sources}
+    read = {Path(file).resolve() for file in loaded.files}
+    return presets.isdisjoint(read) and not sections >= set(loaded.data)
 
 
 def choose_preset(plugins: Plugins) -> tuple[str, str]:

@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from droidw import load_plugins
 from droidw.cli.main import main
 from droidw.cli.run import _split
 from droidw.errors import UsageError
@@ -85,6 +86,33 @@ def test_a_file_beats_the_preset_and_is_beaten_by_overrides(run, tmp_path):
     assert code == 0, wrong
     facts = json.loads((out / "manifest.json").read_text())
     assert (facts["frames"], facts["seed"]) == (3, 5)
+
+
+def test_a_file_without_a_preset_is_put_on_the_usual_one(tmp_path, monkeypatch):
+    import droidw.run
+    from droidw.cli.run import execute
+
+    seen = []
+    monkeypatch.setattr(droidw.run, "run", lambda resolved, *rest, **more: seen.append(resolved))
+    environ = {"DROIDW_LOAD_PLUGINS": "", "DROIDW_WEIGHTS": str(tmp_path)}
+
+    def resolved(text, *overrides):
+        file = tmp_path / "mine.yaml"
+        file.write_text(text)
+        execute(load_plugins(environ=environ), [file], None, list(overrides), tmp_path / "out")
+        return seen.pop()
+
+    changes = resolved("input: {source: clip.mp4}\ncamera: {fov: 70}\n")
+    assert (changes.preset, changes.config.camera.fov) == ("cpu", 70)
+    assert changes.config.uncertainty.options["init_scale"] == 0.0
+    extended = resolved("extends: presets/cpu\nseed: 3\n", "input.source=clip.mp4")
+    assert (extended.preset, extended.config.seed) == (None, 3)
+    assert extended.config.uncertainty == changes.config.uncertainty
+    # what a run leaves means the same again
+    published = resolved("uncertainty: {options: {init_scale: 1.0}}\n", "input.source=clip.mp4")
+    again = resolved(published.to_yaml())
+    assert again.preset is None
+    assert again.config == published.config
 
 
 def test_plugin_from_a_file(run, tmp_path):
