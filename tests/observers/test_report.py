@@ -259,3 +259,24 @@ def test_nearer_points_hide_others() -> None:
     assert (middle[..., 3] == 255).mean() > 0.97
     assert (middle[..., 2] > 0).mean() > 0.9, "red lies in front of blue"
     assert not splat(points[-1:], rgb[-1:], (80, 60), (60.0, 40.0, 30.0)).any()
+
+
+def test_depth_pictures_bear_outliers(full: RunResult) -> None:
+    """One cell in a hundred that is far off changes no colour of the others."""
+    ramp = np.linspace(0.2, 1.0, 1200, dtype=np.float32).reshape(30, 40)
+    off = ramp.copy()
+    off[::10, ::10] = 500.0
+    off[5, 20] = np.inf
+
+    def shown(disp: np.ndarray, valid: bool) -> np.ndarray:
+        record = replace(
+            full.keyframes[0], disp=disp, disp_full=None, depth_valid=np.full((30, 40), valid)
+        )
+        uri = keyframe_pictures([record] * 2, full.stride, full.offset, 2)[1].depth
+        data = np.frombuffer(base64.b64decode(uri.partition(",")[2]), np.uint8)
+        return np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=float)
+
+    difference = np.abs(shown(ramp, True) - shown(off, True)).max(-1)
+    assert np.median(difference) < 12
+    grey = shown(ramp, False).mean(-1)
+    assert grey[-20:].mean() > grey[110:130].mean() + 20 > grey[:20].mean() + 40

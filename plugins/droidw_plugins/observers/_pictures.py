@@ -91,12 +91,12 @@ def keyframe_pictures(
             )
         else:
             disp = spread(record.disp)
-        depth = cv2.applyColorMap(
-            (255 * _level(disp, d_low, d_high)).astype(np.uint8), cv2.COLORMAP_TURBO
-        )
+        near = _level(disp, d_low, d_high)
+        depth = cv2.applyColorMap((255 * near).astype(np.uint8), cv2.COLORMAP_TURBO)
         valid = np.clip(spread(record.depth_valid.astype(np.float32)), 0, 1)[..., None]
-        grey = cv2.cvtColor(cv2.cvtColor(depth, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
-        shaded = (depth * valid + (0.35 * grey + 40) * (1 - valid)).astype(np.uint8)
+        # Not the brightness of the colours, which is low at both ends: near is light, far dark.
+        grey = (60 + 90 * near)[..., None]
+        shaded = (depth * valid + grey * (1 - valid)).astype(np.uint8)
         pictures.append(
             KeyframePictures(
                 number=number,
