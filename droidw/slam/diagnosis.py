@@ -142,7 +142,8 @@ def parallax(store: KeyframeStore, weight: Tensor) -> float:
     used = weight[ii] * (valid & seen & (depth >= NEAR))
     if not float(used.sum()) > 0:
         return float("nan")
-    whole = _median((coords - grid).norm(dim=-1), used)
+    flow = torch.where(used[..., None] > 0, flow, 0.0)
+    whole = _median(torch.linalg.vector_norm(coords - grid, dim=-1), used)
     # Flow of a small turn about x, y and z (REFERENCE 2.3).
     J = torch.stack(
         (
@@ -165,12 +166,13 @@ def _without_turn(flow: Tensor, J: Tensor, weight: Tensor, least: float) -> Tens
     """
     JJ = torch.einsum("hwcp,hwcq->hwpq", J, J)
     some = 1e-6 * torch.eye(3, device=J.device)
-    left = flow.norm(dim=-1)
+    left: Tensor = torch.linalg.vector_norm(flow, dim=-1)
     for _ in range(_ROUNDS):
         scale = weight / left.clamp_min(max(least, 1e-9))
         A = torch.einsum("ehw,hwpq->epq", scale, JJ) + some
         turn = torch.linalg.solve(A, torch.einsum("ehwc,hwcp->ep", scale[..., None] * flow, J))
-        left = (flow - torch.einsum("hwcp,ep->ehwc", J, turn)).norm(dim=-1)
+        rest = flow - torch.einsum("hwcp,ep->ehwc", J, turn)
+        left = torch.linalg.vector_norm(rest, dim=-1)
     return left
 
 
