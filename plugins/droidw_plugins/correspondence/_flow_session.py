@@ -61,11 +61,15 @@ class FlowSession:
         if not rows:
             return []
         edges = [self._edges[request.ids[row]] for row in rows]
-        sure = np.stack([e.confidence.max(axis=-1) for e in edges]) > 0.1
-        away = np.abs(coords[rows] - np.stack([e.target for e in edges])).max(axis=-1)
-        known = sure.mean(axis=(1, 2))
-        far = ((away > opt.restart) & sure).mean(axis=(1, 2))
-        return [row for row, k, f in zip(rows, known, far, strict=True) if k < 0.02 or f > k / 2]
+        astray = []
+        for row, edge in zip(rows, edges, strict=True):
+            sure = np.maximum(edge.confidence[..., 0], edge.confidence[..., 1]) > 0.1
+            away = np.abs(coords[row] - edge.target)
+            far = sure & (np.maximum(away[..., 0], away[..., 1]) > opt.restart)
+            known = np.count_nonzero(sure)
+            if known < 0.02 * sure.size or np.count_nonzero(far) > known / 2:
+                astray.append(row)
+        return astray
 
     def _measure_one_way(self, request: EdgeRequest, wanted: list[int]) -> None:
         def job(row: int) -> Callable[[], Edge]:
