@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from droidw.plugin.component import BuildContext, Component
+from droidw_plugins.datasets._options import PosedOptions
 
 if TYPE_CHECKING:
     from droidw.interfaces.datasets import DatasetReader
@@ -15,17 +15,8 @@ __all__ = ["COMPONENT", "EurocOptions"]
 
 
 @dataclass(frozen=True)
-class EurocOptions:
+class EurocOptions(PosedOptions):
     """Options of the reader `euroc`."""
-
-    max_difference: float = field(
-        default=0.02,
-        metadata={"help": "largest time between a picture and its true pose, in s", "gt": 0},
-    )
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.max_difference) and self.max_difference > 0):
-            raise ValueError(f"max_difference must be positive, not {self.max_difference}")
 
 
 def _make(options: EurocOptions, context: BuildContext) -> DatasetReader:
