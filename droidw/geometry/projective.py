@@ -19,11 +19,13 @@ if TYPE_CHECKING:
 __all__ = [
     "FAR_DISTANCE",
     "NEAR",
+    "depth_there",
     "frame_distance",
     "jacobians",
     "pixel_grid",
     "relative_pose",
     "reproject",
+    "viewing_rays",
 ]
 
 NEAR = 0.25
@@ -83,6 +85,26 @@ def reproject(
     uv = points[:, :2] / Z.clamp_min(NEAR)[:, None]
     coords = uv.transpose(1, 2).contiguous().view(n_edges, h, w, 2)
     return coords, (Z >= NEAR).view(n_edges, h, w)
+
+
+def viewing_rays(h: int, w: int, intrinsics: Tensor) -> Tensor:
+    """Viewing rays [h, w, 3] of the cells, of depth 1; intrinsics [4] of the grid."""
+    fx, fy, cx, cy = intrinsics.unbind()
+    x = (torch.arange(w, device=intrinsics.device) - cx) / fx
+    y = (torch.arange(h, device=intrinsics.device) - cy) / fy
+    yy, xx = torch.meshgrid(y, x, indexing="ij")
+    return torch.stack([xx, yy, torch.ones_like(xx)], -1)
+
+
+def depth_there(T_cw: Tensor, disps: Tensor, intrinsics: Tensor, ii: Tensor, jj: Tensor) -> Tensor:
+    """Depth that the cells of frames ii have in frames jj, [E, h, w]; may be negative.
+
+    Args: as of `reproject`.
+    """
+    G = relative_pose(T_cw, ii, jj)
+    rays = viewing_rays(disps.shape[-2], disps.shape[-1], intrinsics)
+    along = torch.einsum("ec,hwc->ehw", se3.rotation(G)[:, 2], rays)
+    return along / disps[ii] + G[:, 2, None, None]
 
 
 def jacobians(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from droidw.geometry import se3
-from droidw.geometry.projective import relative_pose, reproject
+from droidw.geometry.projective import depth_there, reproject, viewing_rays
 from droidw.slam.frame import CloudPoints
 
 if TYPE_CHECKING:
@@ -50,8 +50,7 @@ def consistent_depth(
         ii = torch.arange(first, last, device=store.device)
         jj = ii + gap
         coords, valid = reproject(store.T_cw, store.disps, store.intrinsics, ii, jj)
-        G = relative_pose(store.T_cw, ii, jj)
-        there = _depth_there(store, G, ii)
+        there = depth_there(store.T_cw, store.disps, store.intrinsics, ii, jj)
         x0, y0 = coords[..., 0].floor().long(), coords[..., 1].floor().long()
         agrees = torch.zeros_like(valid)
         for dx in (0, 1):
@@ -61,28 +60,9 @@ def consistent_depth(
                 flat = (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).flatten(1)
                 seen = store.disps[jj].flatten(1).gather(1, flat).view_as(there)
                 agrees |= inside & ((there * seen - 1.0).abs() < relative_threshold)
-
         views[first:last] += (agrees & valid).long()
     # A disparity at its lower bound is no measurement, however many views share it.
     return (views >= min_views) & (store.disps > 1.01 * min_disp)
-
-
-def _depth_there(store: KeyframeStore, G: Tensor, ii: Tensor) -> Tensor:
-    """Depth [E,h,w] that the cells of frames ii have in the other camera."""
-    rays = _rays(store)
-    R, t = se3.rotation(G), G[:, :3]
-    disps = store.disps[ii]
-    z = torch.einsum("ec,hwc->ehw", R[:, 2], rays) / disps + t[:, 2, None, None]
-    return z
-
-
-def _rays(store: KeyframeStore) -> Tensor:
-    """Viewing rays [h,w,3] of the grid with unit depth."""
-    fx, fy, cx, cy = store.intrinsics.unbind()
-    x = (torch.arange(store.grid.width, device=store.device) - cx) / fx
-    y = (torch.arange(store.grid.height, device=store.device) - cy) / fy
-    gy, gx = torch.meshgrid(y, x, indexing="ij")
-    return torch.stack([gx, gy, torch.ones_like(gx)], -1)
 
 
 def static_cloud(
@@ -101,7 +81,7 @@ def static_cloud(
     keep = valid & (weight >= options.min_weight)
     if options.far > 0 and bool(keep.any()):
         keep &= depth < options.far * depth[keep].median()
-    rays = _rays(store)
+    rays = viewing_rays(store.grid.height, store.grid.width, store.intrinsics)
     T_wc = se3.inv(store.T_cw)
     points = se3.act(T_wc[:, None], (rays[None] * depth[..., None]).flatten(1, 2))
     chosen = keep.flatten().nonzero()[:, 0]

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from droidw.geometry import se3
-from droidw.geometry.projective import NEAR, pixel_grid, relative_pose, reproject
+from droidw.geometry.projective import depth_there, reproject
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.solve.problem import BAProblem
 from droidw.solve.weights import residual_weights
@@ -115,9 +114,7 @@ def carry_depth(disps: Tensor, T_cw: Tensor, intrinsics: Tensor) -> Tensor:
     pair = torch.tensor([0, 1], device=disps.device)
     both = torch.stack([disps, disps])
     coords, valid = reproject(T_cw, both, intrinsics, pair[:1], pair[1:])
-    # disparity in the other camera: d / Z, with Z the relative depth of the point there
-    z = _relative_depth(T_cw, disps, intrinsics)
-    there = disps / z.clamp_min(NEAR)
+    there = depth_there(T_cw, both, intrinsics, pair[:1], pair[1:])[0].reciprocal()
     x, y = (coords[0] + 0.5).floor().long().unbind(-1)
     ok = valid[0] & (x >= 0) & (y >= 0) & (x < width) & (y < height)
     flat = disps.new_zeros(height * width)
@@ -135,15 +132,3 @@ def carry_depth(disps: Tensor, T_cw: Tensor, intrinsics: Tensor) -> Tensor:
         carried = torch.where(known > 0, carried, total / count.clamp_min(1.0))
         known = (known + count).clamp_max(1.0)
     return carried
-
-
-def _relative_depth(T_cw: Tensor, disps: Tensor, intrinsics: Tensor) -> Tensor:
-    """Z [h,w] of the cells of the first camera in the other (REFERENCE 2.1)."""
-    pair = torch.tensor([0, 1], device=disps.device)
-    G = relative_pose(T_cw, pair[:1], pair[1:])
-    row = se3.rotation(G)[0, 2].to(disps.dtype)
-    fx, fy, cx, cy = intrinsics.unbind()
-    height, width = disps.shape
-    xy = pixel_grid(height, width, disps.dtype, disps.device)
-    ray = row[0] * (xy[..., 0] - cx) / fx + row[1] * (xy[..., 1] - cy) / fy + row[2]
-    return ray + G[0, 2].to(disps.dtype) * disps
