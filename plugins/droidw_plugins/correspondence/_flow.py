@@ -88,9 +88,7 @@ class FlowCorrespondence:
             self._track = None
             return Motion(0.0, 0.0)  # a blank picture agrees with whatever is as bright
         start = None if self._track is None else self._track.ahead(reference, current)
-        moved, agrees = self._one_way(
-            reference, current, lambda a, b: self._remember(a, b, self._search(a, b, start))
-        )
+        moved, agrees = self._one_way(reference, current, lambda a, b: self.free(a, b, start))
         motion = self._motion(moved, agrees, reference)
         known = motion.matched > _TRACKED
         flow = self._remembered(reference, current) if known else None
@@ -139,17 +137,16 @@ class FlowCorrespondence:
         with self._lock:
             return self._full.get((a.index, b.index))
 
-    def _remember(self, a: FlowFrame, b: FlowFrame, flow: Array) -> Array:
-        with self._lock:
-            self._full[(a.index, b.index)] = flow
-            while len(self._full) > _FULL_FIELDS:
-                self._full.popitem(last=False)
-        return flow
-
     def free(self, a: FlowFrame, b: FlowFrame, start: Array | None = None) -> Array:
         """Flow a -> b without geometry, remembered for a while; `start` [H,W,2] where known."""
-        known = self._remembered(a, b)
-        return self._remember(a, b, self._search(a, b, start)) if known is None else known
+        flow = self._remembered(a, b)
+        if flow is None:
+            flow = self._search(a, b, start)
+            with self._lock:
+                self._full[(a.index, b.index)] = flow
+                while len(self._full) > _FULL_FIELDS:
+                    self._full.popitem(last=False)
+        return flow
 
     def _one_way(
         self, a: FlowFrame, b: FlowFrame, search: Callable[[FlowFrame, FlowFrame], Array]
