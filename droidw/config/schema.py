@@ -252,5 +252,5 @@ class DroidwConfig:
 
     device: str = opt("auto", "auto, cpu, cuda, cuda:N")
     seed: int = opt(0, "seed of everything that draws numbers", ge=0)
-    threads: int = opt(0, "worker threads for decoding and flow (0: as many as cores)", ge=0)
+    threads: int = opt(0, "cores to use, half of them for torch (0: all)", ge=0)
     compat: list[str] = opt([], "published behaviours to reproduce, e.g. [droid-w]")
