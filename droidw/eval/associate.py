@@ -168,9 +168,14 @@ def _guess(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64]) -> tuple[
                 f"write the {word} with the seconds of its frames (the first column of rgb.txt)",
             )
     ratio = np.median(est) / np.median(ref) if np.median(ref) else 0.0
+    spacing = _spacing(est) / _spacing(ref)
     for factor, unit in ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")):
-        for value, word in ((ratio, "estimate"), (1 / ratio if ratio else 0.0, "reference")):
-            if 0.5 * factor < value < 2 * factor and np.abs(value - factor) < 0.5 * factor:
+        for value, steps, word in (
+            (ratio, spacing, "estimate"),
+            (1 / ratio if ratio else 0.0, 1 / spacing, "reference"),
+        ):
+            # In another unit the steps between stamps are larger too; a later clock has the same.
+            if np.abs(value - factor) < 0.5 * factor and steps > factor**0.5:
                 return (
                     f"the {word} looks like {unit}",
                     f"divide the first column of the {word} by {factor:.0e}",
@@ -188,6 +193,13 @@ def _guess(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64]) -> tuple[
         f"the nearest two are {nearest:.4g} s apart",
         "if the clocks are that coarse: --t-max-diff SECONDS",
     )
+
+
+def _spacing(times: npt.NDArray[np.float64]) -> float:
+    """The usual step between stamps in time order; 1 where there is none."""
+    steps = np.diff(np.sort(times))
+    steps = steps[steps > 0]
+    return float(np.median(steps)) if len(steps) else 1.0
 
 
 def _like_indices(times: npt.NDArray[np.float64]) -> bool:

@@ -7,23 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from droidw.errors import InputError
+from droidw.eval.mask_files import (
+    check_shape,
+    find_masks,
+    frames_beside,
+    pictures_in,
+    read_mask,
+    read_uncertainty,
+    resize_mask,
+    shapes_shown,
+)
 
-__all__ = [
-    "MaskScore",
-    "find_masks",
-    "read_mask",
-    "read_uncertainty",
-    "resize_mask",
-    "score_folder",
-    "score_masks",
-]
-
-_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+__all__ = ["MaskScore", "score_folder", "score_masks"]
 
 
 @dataclass(frozen=True)
@@ -128,21 +127,25 @@ def score_masks(
     )
 
 
-def score_folder(uncertainty: Path, masks: Path, after: int = 0) -> MaskScore:
+def score_folder(
+    uncertainty: Path, masks: Path, after: int = 0, source: Path | None = None
+) -> MaskScore:
     """Score the maps `uncertainty/NNNNNN.png` (named by frame index) against a folder of masks.
 
-    Both are taken to show the same field of view; a mask is reduced to the size of its map.
+    Both are taken to show the same field of view, so that a mask of any size is reduced to that of
+    its map; one of another shape is refused. Which mask belongs to which picture: `find_masks`.
 
     Args:
         uncertainty: folder of maps. masks: folder of masks, see `find_masks`.
         after: the first maps, so many, are left out: a model that learns online knows nothing yet.
+        source: folder that the run was made from, for the names of its pictures.
     Raises:
-        InputError: if a folder is missing, a file cannot be read, no map has a mask, or none is
-            left.
+        InputError: if a folder is missing, a file cannot be read, a mask has another shape than
+            the pictures, no map has a mask, or none is left.
     """
     maps = {
         int(path.stem): path
-        for path in _pictures(uncertainty)
+        for path in pictures_in(uncertainty)
         if path.suffix.lower() == ".png" and path.stem.isdigit()
     }
     if not maps:
@@ -155,10 +158,9 @@ def score_folder(uncertainty: Path, masks: Path, after: int = 0) -> MaskScore:
             "leave fewer out: --masks-after N",
         )
     maps = {index: maps[index] for index in sorted(maps)[after:]}
-    known = find_masks(masks)
-    notes: list[str] = []
+    known = find_masks(masks, source)
     pairs = [(maps[index], known[index]) for index in sorted(maps) if index in known]
-    if max(maps) >= len(known) == max(known) + 1 and not _frame_names(masks.parent):
+    if max(maps) >= len(known) == max(known) + 1 and not frames_beside(masks, source):
         raise InputError(
             f"{masks}: its {len(known)} masks cannot be laid on the pictures: the uncertainty maps "
             f"go up to picture {max(maps)}, counted from 0",
@@ -166,20 +168,23 @@ def score_folder(uncertainty: Path, masks: Path, after: int = 0) -> MaskScore:
         )
     if not pairs:
         raise InputError(
-            f"{masks}: no mask belongs to any of the {len(maps)} uncertainty maps in {uncertainty}"
+            f"{masks}: no mask belongs to any of the {len(maps)} uncertainty maps in {uncertainty}",
+            "name each mask like its picture, or give one mask per picture, in their order",
         )
+    shown = shapes_shown(uncertainty, masks, source)
     values: list[npt.NDArray[Any]] = []
     truth: list[npt.NDArray[np.bool_]] = []
     for map_path, mask_path in pairs:
         u, mask = read_uncertainty(map_path), read_mask(mask_path)
-        stretch = (mask.shape[1] / mask.shape[0]) / (u.shape[1] / u.shape[0])
-        if not 0.95 < stretch < 1.05 and not notes:
-            notes.append(
-                f"the masks are {mask.shape[1]}x{mask.shape[0]} and the maps {u.shape[1]}x"
-                f"{u.shape[0]}: of another shape, so they may not lie on each other"
-            )
+        check_shape(mask_path, mask, u, shown)
         values.append(u)
         truth.append(resize_mask(mask, (u.shape[0], u.shape[1])))
+    notes = []
+    if len(pairs) < len(maps):
+        notes.append(
+            f"{len(pairs)} of {len(maps)} uncertainty maps have a mask in {masks}; the others are "
+            "not scored"
+        )
     result = score_masks(values, truth)
     return MaskScore(
         **{
@@ -188,84 +193,3 @@ def score_folder(uncertainty: Path, masks: Path, after: int = 0) -> MaskScore:
             "notes": (*notes, *result.notes),
         }
     )
-
-
-def find_masks(folder: Path) -> dict[int, Path]:
-    """Masks by the index of their frame.
-
-    Frames are those of `rgb.txt` beside the folder, or else of `rgb/` beside it, in order, and a
-    mask has the name of its frame; without such names, masks are counted from 0.
-
-    Raises:
-        InputError: if the folder is missing or holds no pictures, or if names and count of the
-            masks are both other than those of the pictures.
-    """
-    files = _pictures(folder)
-    if not files:
-        raise InputError(f"{folder}: holds no masks", "expected pictures, white where it moves")
-    by_stem = {path.stem: path for path in files}
-    frames = _frame_names(folder.parent)
-    named = {index: by_stem[name] for index, name in enumerate(frames) if name in by_stem}
-    if not named and frames and len(frames) != len(files):
-        raise InputError(
-            f"{folder}: its {len(files)} masks cannot be laid on {len(frames)} pictures: none has "
-            "the name of a picture, and the count is another",
-            "name each mask like its picture, or give one mask per picture",
-        )
-    return named or dict(enumerate(files))
-
-
-def _frame_names(folder: Path) -> list[str]:
-    listing = folder / "rgb.txt"
-    if listing.is_file():
-        lines = listing.read_text(encoding="utf-8", errors="replace").splitlines()
-        rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
-        return [Path(row[1]).stem for row in rows if len(row) > 1]
-    return [path.stem for path in _pictures(folder / "rgb")] if (folder / "rgb").is_dir() else []
-
-
-def _pictures(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder")
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _PICTURES)
-
-
-def read_mask(path: Path) -> npt.NDArray[np.bool_]:
-    """A mask [H,W] bool from a picture: True where it is brighter than half.
-
-    A picture with values 0 and 1 alone counts as 0 and 255.
-
-    Raises:
-        InputError: if the file is no picture.
-    """
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise InputError(f"{path}: cannot be read as a picture")
-    return np.asarray(picture > (0 if picture.max(initial=0) == 1 else 127))
-
-
-def read_uncertainty(path: Path) -> npt.NDArray[np.uint16]:
-    """A map [h,w] uint16 as it is stored; 8-bit pictures are read too.
-
-    Raises:
-        InputError: if the file is no grey picture.
-    """
-    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        raise InputError(f"{path}: cannot be read as a picture")
-    if picture.ndim != 2:
-        raise InputError(f"{path}: is a colour picture", "uncertainty maps are grey, 16 bits")
-    return np.asarray(picture).astype(np.uint16)
-
-
-def resize_mask(mask: npt.NDArray[np.bool_], shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Reduce a mask [H,W] to a grid [h,w]: True where at least half of a cell's area moves."""
-    height, width = shape
-    if mask.shape == shape:
-        return np.array(mask, dtype=bool)
-    if height <= mask.shape[0] and width <= mask.shape[1]:
-        share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-        # Half a cell may come out as 0.4999999.
-        return np.asarray(share >= 0.5 - 1e-5)
-    near = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-    return np.asarray(near > 0)

@@ -78,7 +78,8 @@ def evaluate(
         reference: TUM file, folder that holds `groundtruth.txt`, or None for the `truth.tum` of
             the run folder, or the source that the run folder names.
         align, max_diff, offset, delta, normalise, unit: as for `score`.
-        masks: folder of masks, or None to look for `mask/` in the source of the run.
+        masks: folder of masks, or None to look for `mask/` in the source of the run; what is
+            wrong with masks that were only found is a note.
         masks_after: leave so many keyframes at the start out of the score of the masks.
     Raises:
         UsageError: if no reference is given and none can be found, and no masks either.
@@ -92,13 +93,21 @@ def evaluate(
             "give a run folder that holds trajectory.tum, or a TUM file (t tx ty tz qx qy qz qw)",
         )
     source = source_of(run_dir) if run_dir else None
-    found = mask_score(run_dir, source, masks, masks_after)
+    found: MaskScore | None = None
+    notes: list[str] = []
+    try:
+        found = mask_score(run_dir, source, masks, masks_after)
+    except InputError as error:
+        if masks is not None:
+            raise
+        # Nobody asked for the masks beside the footage: the trajectory is worth its figures.
+        notes.append(f"masks are not scored: {error.message}")
     reference = reference or _known_reference(run_dir, source)
     if reference is None and found is not None:
         return Evaluation(None, masks=found, notes=(f"only masks are scored: {_NO_REFERENCE}",))
     if reference is None:
         raise UsageError(
-            f"nothing to compare with: {_NO_REFERENCE}",
+            f"nothing to compare with: {_NO_REFERENCE}" + "".join(f"; {note}" for note in notes),
             "give one: --ref FILE (TUM: t tx ty tz qx qy qz qw) or --ref FOLDER (with "
             "groundtruth.txt), or masks of what moves: --masks DIR",
         )
@@ -114,7 +123,6 @@ def evaluate(
     }
     frames = _score_file(_File.read(file), truth, options)
     keyframes = None
-    notes: list[str] = []
     if run_dir and (run_dir / "keyframes.tum").is_file():
         key_file = run_dir / "keyframes.tum"
         try:
@@ -201,7 +209,7 @@ def mask_score(
         masks = source / "mask"
     from droidw.eval.masks import score_folder
 
-    return score_folder(maps, masks, after)
+    return score_folder(maps, masks, after, source)
 
 
 def reference_file(reference: Path) -> Path:

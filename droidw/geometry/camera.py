@@ -376,7 +376,13 @@ class Rectifier:
         """
         image = torch.from_numpy(self.rectify_image(raw.image))
         planes = image.permute(2, 0, 1).to(torch.float32).div_(255.0).contiguous()
-        ignored = None if mask is None else torch.from_numpy(self.rectify_mask(mask))
+        ignored = None
+        if mask is not None:
+            try:
+                ignored = torch.from_numpy(self.rectify_mask(mask))
+            except InputError as error:
+                said = f"the mask of picture {raw.index} ('{raw.name}'): {error.message}"
+                raise InputError(said, f"{error.hint}: --masks DIR") from error
         return Frame(raw.index, raw.time, planes, self.camera.intrinsics(), raw.name, ignored)
 
 

@@ -16,6 +16,7 @@ __all__ = ["UserMasks"]
 
 _LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
 _LOSSY = (".jpg", ".jpeg")
+_NEAR = 0.02  # seconds between a picture and its mask, where names are times
 _SAYS = "a mask is a picture per frame: black is used, everything else is ignored"
 
 
@@ -23,9 +24,11 @@ class UserMasks:
     """Masks in a folder, looked up frame by frame; safe to call from any thread.
 
     A mask belongs to the picture of the same name (`0012.png` to `0012.jpg`). Where the name of
-    the first picture is not among the masks, they go by order if there are as many as pictures;
-    else by number, if their names are indices of frames counted from 0 (`000012.png`, as droidw
-    writes them). Masks that droidw wrote (`masks/scale.json` says so) always go by number.
+    the first picture is not among the masks, they go by time if their names are seconds
+    (`1311868164.36.png`) and one is within 0.02 s of the first picture; else by order if there are
+    as many as pictures; else by number, if their names are indices of frames counted from 0
+    (`000012.png`, as droidw writes them). Masks that droidw wrote (`masks/scale.json` says so)
+    always go by number.
 
     Args:
         folder: of pictures; black is used, everything else is ignored (a JPEG: what is brighter
@@ -48,6 +51,7 @@ class UserMasks:
         self._missing: set[int] = set()
         self._files = sorted(files)
         self._by_name = {path.stem: path for path in self._files}
+        self._times: npt.NDArray[np.float64] | None = None
         self._by_index: dict[int, Path] | None = _numbers(files) if _written_by_us(folder) else None
         self._settled = self._by_index is not None
 
@@ -59,11 +63,7 @@ class UserMasks:
         """
         if not self._settled:
             self._settle(frame)
-        path = (
-            self._by_name.get(Path(frame.name).stem)
-            if self._by_index is None
-            else self._by_index.get(frame.index)
-        )
+        path = self._path(frame)
         self._asked.add(frame.index)
         if path is None:
             self._missing.add(frame.index)
@@ -73,6 +73,18 @@ class UserMasks:
             raise InputError(f"input.masks: {path}: cannot be read as a picture")
         least = 127 if path.suffix.lower() in _LOSSY else 0
         return np.asarray((np.asarray(picture) > least).any(axis=2))
+
+    def _path(self, frame: RawFrame) -> Path | None:
+        if self._times is not None:
+            nearest = int(np.abs(self._times - frame.time).argmin())
+            return self._files[nearest] if self._near(frame.time, nearest) else None
+        if self._by_index is not None:
+            return self._by_index.get(frame.index)
+        return self._by_name.get(Path(frame.name).stem)
+
+    def _near(self, time: float, row: int) -> bool:
+        assert self._times is not None
+        return bool(abs(self._times[row] - time) <= _NEAR)
 
     def problems(self) -> list[str]:
         """Sentences about pictures that had no mask."""
@@ -89,6 +101,11 @@ class UserMasks:
         stem = Path(first.name).stem
         if stem in self._by_name:
             return
+        self._times = _seconds(self._files)
+        if self._times is not None:
+            if self._near(first.time, int(np.abs(self._times - first.time).argmin())):
+                return
+            self._times = None
         count, least, most = len(self._files), self._least, self._most
         if least and least <= count and (most is None or count <= most):
             self._by_index = dict(enumerate(self._files))
@@ -108,6 +125,15 @@ class UserMasks:
 
 def _numbers(files: list[Path]) -> dict[int, Path]:
     return {int(path.stem): path for path in files if path.stem.isdecimal()}
+
+
+def _seconds(files: list[Path]) -> npt.NDArray[np.float64] | None:
+    """The times that the names are, or None if they are not all fractions of seconds."""
+    try:
+        times = np.array([float(path.stem) for path in files if "." in path.stem])
+    except ValueError:
+        return None
+    return times if len(times) == len(files) and np.isfinite(times).all() else None
 
 
 def _written_by_us(folder: Path) -> bool:

@@ -187,7 +187,11 @@ def test_what_is_wrong_is_said(places: tuple[Path, Path], tmp_path: Path) -> Non
         ((run, "--ref", truth, "--delta", "0"), 2, "--delta"),
         ((run / "trajectory.tum", "--ref", truth, "--masks", source / "mask"), 2, "--masks"),
         ((run, "--ref", truth, "--masks", tmp_path / "no"), 3, "no such folder"),
-        ((run, "--ref", truth, "--masks-after", "2"), 3, "none is left after the first 2"),
+        (
+            (run, "--ref", truth, "--masks", source / "mask", "--masks-after", "2"),
+            3,
+            "none is left after the first 2",
+        ),
         ((run, "--ref", truth, "--masks-after", "-1"), 2, "--masks-after counts keyframes from 0"),
         ((run, "--ref", truth, "--plot", truth), 2, "--plot: cannot make the folder"),
     ]
@@ -195,6 +199,62 @@ def test_what_is_wrong_is_said(places: tuple[Path, Path], tmp_path: Path) -> Non
         error = refusal(*words)
         assert error.exit_code == code, words
         assert said in str(error), str(error)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (48, 64), (96, 48)], ids=str)
+def test_masks_of_another_shape(
+    places: tuple[Path, Path], size: tuple[int, int], capsys: pytest.CaptureFixture
+) -> None:
+    """Refused where they were asked for; where they lie beside the footage, the poses count."""
+    run, source = places
+    (run / "uncertainty" / "scale.json").write_text(json.dumps({"picture": [64, 48]}))
+    for path in (source / "mask").iterdir():
+        cv2.imwrite(str(path), np.zeros((size[1], size[0]), np.uint8))
+    error = refusal(run, "--masks", source / "mask")
+    assert error.exit_code == 3
+    assert f"{source / 'mask' / '000000.png'}: a mask of {size[0]}x{size[1]} pixels" in str(error)
+    assert "does not fit pictures of 64x48" in str(error) and "--masks DIR" in error.hint
+    assert run_eval(run, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert "masks" not in record and record["ate_rmse"] < 0.03
+    assert any("masks are not scored: " in note for note in record["notes"])
+
+
+@pytest.mark.parametrize("size", [(640, 480), (32, 24), (8, 6)], ids=str)
+def test_masks_of_another_size(
+    places: tuple[Path, Path], size: tuple[int, int], capsys: pytest.CaptureFixture
+) -> None:
+    run, source = places
+    for path in (source / "mask").iterdir():
+        mask = np.zeros((size[1], size[0]), np.uint8)
+        mask[:, : size[0] * 3 // 8] = 255
+        cv2.imwrite(str(path), mask)
+    assert run_eval(run, "--masks", source / "mask", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["masks"]["auc"] == 1.0
+
+
+def test_fewer_masks_than_maps(places: tuple[Path, Path], capsys: pytest.CaptureFixture) -> None:
+    run, source = places
+    (source / "rgb.txt").write_text("0.0 rgb/000000.png\n0.1 rgb/000001.png\n")
+    (source / "mask" / "000000.png").unlink()
+    assert run_eval(run, "--masks", source / "mask") == 0
+    assert "note: 1 of 2 uncertainty maps have a mask" in capsys.readouterr().out
+    (source / "mask" / "000001.png").rename(source / "mask" / "other.png")
+    error = refusal(run, "--masks", source / "mask")
+    assert error.exit_code == 3
+    assert "its 1 masks cannot be laid on 2 pictures" in str(error)
+    assert "name each mask like its picture" in error.hint
+
+
+def test_truth_of_another_time(places: tuple[Path, Path]) -> None:
+    run, source = places
+    truth = circle(60)
+    truth[:, 0] += 500.0
+    np.savetxt(source / "groundtruth.txt", truth)
+    error = refusal(run)
+    assert error.exit_code == 3
+    assert "0 pairs within 0.02 s, at least" in str(error)
+    assert "they lie 498.033 s apart" in str(error) and "--t-offset 500.0" in error.hint
 
 
 def test_frame_indices_for_stamps(places: tuple[Path, Path]) -> None:

@@ -9,13 +9,8 @@ import numpy as np
 import pytest
 
 from droidw.errors import InputError
-from droidw.eval.masks import (
-    find_masks,
-    read_mask,
-    resize_mask,
-    score_folder,
-    score_masks,
-)
+from droidw.eval.mask_files import check_shape, find_masks, read_mask, resize_mask
+from droidw.eval.masks import score_folder, score_masks
 
 
 def brute_force(u: np.ndarray, mask: np.ndarray) -> tuple[float, float, float]:
@@ -103,7 +98,7 @@ def test_a_mask_is_reduced_by_area() -> None:
 def folder(tmp_path: Path, names: list[str], listed: bool) -> Path:
     """A sequence whose masks mark the left half, and run maps that find it."""
     for sub in ("rgb", "mask", "uncertainty"):
-        (tmp_path / sub).mkdir()
+        (tmp_path / sub).mkdir(parents=True)
     for number, name in enumerate(names):
         mask = np.zeros((48, 64), np.uint8)
         mask[:, : 32 if number else 16] = 255
@@ -152,11 +147,57 @@ def test_another_count_is_refused(tmp_path: Path) -> None:
         score_folder(root / "uncertainty", root / "mask")
 
 
-def test_another_shape_is_told(tmp_path: Path) -> None:
+def test_another_shape_is_refused(tmp_path: Path) -> None:
     root = folder(tmp_path, ["a", "b"], listed=True)
     for path in (root / "uncertainty").iterdir():
         cv2.imwrite(str(path), np.zeros((8, 6), np.uint16))
-    assert "of another shape" in score_folder(root / "uncertainty", root / "mask").notes[0]
+    with pytest.raises(InputError, match=r"a\.png: a mask of 64x48 pixels .* maps of 6x8 cells"):
+        score_folder(root / "uncertainty", root / "mask")
+    # A run may work on another shape than the footage has: axes are then stretched alike.
+    cv2.imwrite(str(root / "rgb" / "a.jpg"), np.zeros((48, 64), np.uint8))
+    assert score_folder(root / "uncertainty", root / "mask").frames == 2
+
+
+@pytest.mark.parametrize(
+    ("shape", "fits"), [((45, 80), True), ((48, 64), False), ((60, 80), False)]
+)
+def test_cropping_to_whole_cells_is_no_other_shape(shape, fits) -> None:
+    """16:9 pictures 80 pixels wide are worked on as 80x40."""
+    u = np.zeros((5, 10), np.uint16)
+    for shown in ([], [(80, 40), (80, 45)]):
+        if fits:
+            check_shape(Path("m.png"), np.zeros(shape, bool), u, shown)
+            continue
+        with pytest.raises(InputError, match="has another shape"):
+            check_shape(Path("m.png"), np.zeros(shape, bool), u, shown)
+
+
+def test_masks_are_found_by_time(tmp_path: Path) -> None:
+    root = folder(tmp_path, ["a", "b", "c", "d"], listed=True)
+    for number, path in enumerate(sorted((root / "mask").iterdir())):
+        path.rename(root / "mask" / f"{number / 30 + 0.004:.6f}.png")
+    (root / "mask" / f"{1 / 30 + 0.004:.6f}.png").unlink()
+    found = score_folder(root / "uncertainty", root / "mask")
+    assert (found.frames, found.without_mask, found.auc) == (3, 1, 1.0)
+    assert "3 of 4 uncertainty maps have a mask" in found.notes[0]
+
+
+def test_masks_elsewhere_go_by_the_names_of_the_source(tmp_path: Path) -> None:
+    root = folder(tmp_path / "clip", ["p", "q", "r"], listed=True)
+    (root / "mask" / "p.png").unlink()
+    masks = (root / "mask").rename(tmp_path / "elsewhere")
+    assert find_masks(masks, root).keys() == {1, 2}
+    # Without the source, nothing says that the first one is missing.
+    assert find_masks(masks).keys() == {0, 1}
+
+
+def test_masks_by_number_where_some_are_missing(tmp_path: Path) -> None:
+    for number in (3, 7, 9):
+        cv2.imwrite(str(tmp_path / f"{number:06d}.png"), np.zeros((4, 4), np.uint8))
+    assert find_masks(tmp_path).keys() == {3, 7, 9}
+    (tmp_path / "000007.png").unlink()
+    (tmp_path / "000003.png").rename(tmp_path / "000008.png")
+    assert find_masks(tmp_path).keys() == {0, 1}  # 8 and 9: counted from somewhere, by order
 
 
 def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from droidw.errors import DroidwError, MissingRequirementError, UsageError
-from droidw.eval.masks import read_uncertainty, score_folder
+from droidw.eval.mask_files import read_uncertainty
+from droidw.eval.masks import score_folder
 from droidw.interfaces.exporters import Exporter
 from droidw.io.masks import UserMasks
 from droidw.slam.frame import RawFrame

@@ -65,6 +65,17 @@ def test_by_number_some_may_be_missing(folder):
     assert told.startswith("1 of 2 pictures have no mask in ")
 
 
+def test_by_time_if_names_are_seconds(folder):
+    masks = UserMasks(folder({"0.002.png": 3, "0.069.png": 5}), 5, 5)
+    assert columns(masks.of(frame(0, "a"))) == 3
+    assert masks.of(frame(1, "b")) is None  # 0.033 s
+    assert columns(masks.of(frame(2, "c"))) == 5
+    assert "1 of 3 pictures have no mask" in masks.problems()[0]
+    # Of another time: they are no masks of these pictures.
+    with pytest.raises(InputError, match="its 2 masks cannot be laid on 5 pictures"):
+        UserMasks(folder({}), 5, 5).of(frame(60, "a"))
+
+
 def test_masks_that_droidw_wrote_go_by_number(folder):
     place = folder({"000001.png": 1, "000002.png": 2})
     (place / "scale.json").write_text(json.dumps({"named": "index"}))
@@ -112,6 +123,8 @@ def test_any_size_is_laid_on_the_picture_without_blending():
     for shape in ((48, 48), (64, 48)):
         with pytest.raises(InputError, match="does not fit pictures of 64x48"):
             rectify.rectify_mask(np.zeros(shape, bool))
+        with pytest.raises(InputError, match=r"the mask of picture 7 \('g.jpg'\): a mask of"):
+            rectify(frame(7, "g.jpg"), np.zeros(shape, bool))
 
 
 @pytest.mark.parametrize(

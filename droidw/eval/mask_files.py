@@ -1,0 +1,222 @@
+"""Masks and uncertainty maps as files: which mask belongs to which picture, and reading."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from droidw.errors import InputError
+from droidw.eval.associate import DEFAULT_MAX_DIFF, associate
+
+__all__ = [
+    "check_shape",
+    "find_masks",
+    "frames_beside",
+    "pictures_in",
+    "read_mask",
+    "read_uncertainty",
+    "resize_mask",
+    "shapes_shown",
+]
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_STRETCH = 0.05
+"""Largest relative difference of two ratios of sides that counts as the same shape: cropping to
+whole cells takes off a few pixels."""
+
+
+def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
+    """Masks by the index of their frame.
+
+    Frames are those of `rgb.txt` beside the folder, else of `rgb/` beside it, else of the source
+    alike, in order. A mask has the name of its frame, or a name that is its time in seconds. Where
+    no mask has such a name, they go by order if there are as many as frames, else by number, if
+    their names are indices of frames counted from 0. Where no frames are known, they go by number
+    if numbers are missing between theirs, else by order.
+
+    Args:
+        folder: of the masks. source: folder that the run was made from, if it is known.
+    Raises:
+        InputError: if the folder is missing or holds no pictures, or if names and count of the
+            masks are both other than those of the pictures.
+    """
+    files = pictures_in(folder)
+    if not files:
+        raise InputError(f"{folder}: holds no masks", "expected pictures, white where it moves")
+    by_stem = {path.stem: path for path in files}
+    frames = frames_beside(folder, source)
+    named = {index: by_stem[name] for index, (name, _) in enumerate(frames) if name in by_stem}
+    if not named:
+        named = _by_time(files, [time for _, time in frames])
+    if named:
+        return named
+    if len(frames) == len(files):
+        return dict(enumerate(files))
+    numbers = {int(path.stem): path for path in files if path.stem.isdecimal()}
+    if len(numbers) == len(files):
+        gaps = max(numbers) - min(numbers) + 1 > len(numbers)
+        if max(numbers) < len(frames) or (gaps and not frames):
+            return numbers
+    if frames:
+        raise InputError(
+            f"{folder}: its {len(files)} masks cannot be laid on {len(frames)} pictures: none has "
+            "the name of a picture, and the count is another",
+            "name each mask like its picture, or give one mask per picture",
+        )
+    return dict(enumerate(files))
+
+
+def _by_time(files: Sequence[Path], times: Sequence[float]) -> dict[int, Path]:
+    """Masks whose names are seconds, by the index of the nearest frame; empty if they are not."""
+    try:
+        stems = [float(path.stem) if "." in path.stem else math.nan for path in files]
+    except ValueError:
+        return {}
+    if not times or not np.isfinite(stems).all() or not np.isfinite(times).all():
+        return {}
+    try:
+        found = associate(np.array(stems), np.array(times), DEFAULT_MAX_DIFF)
+    except InputError:
+        return {}
+    return {int(ref): files[int(est)] for est, ref in zip(found.est, found.ref, strict=True)}
+
+
+def frames_beside(folder: Path, source: Path | None = None) -> list[tuple[str, float]]:
+    """Name and time (NaN if unknown) of the pictures beside a folder of masks, or in the source."""
+    for root in (folder.parent, source):
+        if root is None:
+            continue
+        listing = root / "rgb.txt"
+        if listing.is_file():
+            lines = listing.read_text(encoding="utf-8", errors="replace").splitlines()
+            rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+            return [(Path(row[1]).stem, _seconds(row[0])) for row in rows if len(row) > 1]
+        if (root / "rgb").is_dir():
+            return [(path.stem, math.nan) for path in pictures_in(root / "rgb")]
+    return []
+
+
+def _seconds(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def pictures_in(folder: Path) -> list[Path]:
+    """The pictures of a folder, by name.
+
+    Raises:
+        InputError: if there is no such folder.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: there is no such folder")
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _PICTURES)
+
+
+def shapes_shown(
+    uncertainty: Path, masks: Path, source: Path | None = None
+) -> list[tuple[int, int]]:
+    """Sizes (width, height) of which a mask may have the shape: working picture, raw picture.
+
+    The first is what `scale.json` beside the maps says, the second that of a picture beside the
+    masks or in the source; what is not known is left out.
+    """
+    found = []
+    try:
+        facts = json.loads((uncertainty / "scale.json").read_text(encoding="utf-8"))
+        width, height = (int(side) for side in facts["picture"])
+        found.append((width, height))
+    except (OSError, ValueError, KeyError, TypeError):
+        pass  # maps of another program, or of an older droidw
+    for root in (masks.parent, source):
+        if root is not None and (root / "rgb").is_dir():
+            for path in pictures_in(root / "rgb")[:1]:
+                picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+                if picture is not None:
+                    found.append((picture.shape[1], picture.shape[0]))
+    return [(width, height) for width, height in found if width > 0 and height > 0]
+
+
+def check_shape(
+    path: Path,
+    mask: npt.NDArray[np.bool_],
+    u: npt.NDArray[Any],
+    shown: Sequence[tuple[int, int]] = (),
+) -> None:
+    """Refuse a mask whose sides have another ratio than those of the picture under its map.
+
+    Args:
+        path, mask: the mask [H,W] and its file. u: the map [h,w].
+        shown: sizes of pictures that the mask may show; without any, the map itself tells the
+            ratio as far as whole cells do.
+    Raises:
+        InputError: the mask does not show what the map shows.
+    """
+    height, width = mask.shape
+    rows, columns = u.shape
+    ratio = width / height
+    if any(abs(ratio * h / w - 1) <= _STRETCH for w, h in shown):
+        return
+    least, most = columns / (rows + 1), (columns + 1) / rows
+    slack = 1 + _STRETCH
+    if not shown and min(least, columns / rows / slack) <= ratio <= max(
+        most, columns / rows * slack
+    ):
+        return
+    sizes = " or ".join(dict.fromkeys(f"{w}x{h}" for w, h in shown))
+    raise InputError(
+        f"{path}: a mask of {width}x{height} pixels does not fit "
+        + (f"pictures of {sizes}" if sizes else f"uncertainty maps of {columns}x{rows} cells")
+        + ": it has another shape",
+        "masks may be of any size, but must show the whole picture; give those of this footage: "
+        "--masks DIR",
+    )
+
+
+def read_mask(path: Path) -> npt.NDArray[np.bool_]:
+    """A mask [H,W] bool from a picture: True where it is brighter than half.
+
+    A picture with values 0 and 1 alone counts as 0 and 255.
+
+    Raises:
+        InputError: if the file is no picture.
+    """
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if picture is None:
+        raise InputError(f"{path}: cannot be read as a picture")
+    return np.asarray(picture > (0 if picture.max(initial=0) == 1 else 127))
+
+
+def read_uncertainty(path: Path) -> npt.NDArray[np.uint16]:
+    """A map [h,w] uint16 as it is stored; 8-bit pictures are read too.
+
+    Raises:
+        InputError: if the file is no grey picture.
+    """
+    picture = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise InputError(f"{path}: cannot be read as a picture")
+    if picture.ndim != 2:
+        raise InputError(f"{path}: is a colour picture", "uncertainty maps are grey, 16 bits")
+    return np.asarray(picture).astype(np.uint16)
+
+
+def resize_mask(mask: npt.NDArray[np.bool_], shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
+    """Reduce a mask [H,W] to a grid [h,w]: True where at least half of a cell's area moves."""
+    height, width = shape
+    if mask.shape == shape:
+        return np.array(mask, dtype=bool)
+    if height <= mask.shape[0] and width <= mask.shape[1]:
+        share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        # Half a cell may come out as 0.4999999.
+        return np.asarray(share >= 0.5 - 1e-5)
+    near = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(near > 0)
