@@ -175,8 +175,13 @@ class FillerConfig:
 
 @dataclass
 class WeightingConfig:
-    """How uncertainty u becomes a weight in [0,1] (REFERENCE 3.1)."""
+    """How similarity becomes uncertainty u, and u a weight in [0,1] (REFERENCE 3.1)."""
 
+    similarity: Literal["matched", "raw"] = opt(
+        "matched",
+        "how alike features are: matched: on one scale for all extractors, by measured matches; "
+        "raw: their cosine, as published",
+    )
     gate: Literal["rational", "inverse", "none"] = opt(
         "rational", "rational: 1/max(slope*u - shift, floor); inverse: 1/u; both clamped to [0,1]"
     )

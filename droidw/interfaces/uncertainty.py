@@ -42,6 +42,8 @@ class UncertaintyView:
         target: [E,h,w,2] measured correspondence in cells; confidence: [E,h,w,2].
         frames: [K] int64 keyframes whose maps are to be refreshed.
         iteration: counts updates since the start of the run.
+        calibrate: similarities of these features are to be brought to the scale on which
+            thresholds are meant (docs/features.md); false: their cosine is taken as it is.
     """
 
     features: Tensor
@@ -56,6 +58,7 @@ class UncertaintyView:
     confidence: Tensor
     frames: Tensor
     iteration: int = 0
+    calibrate: bool = False
 
 
 @dataclass(frozen=True)

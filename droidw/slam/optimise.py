@@ -49,15 +49,26 @@ class Optimiser:
         parts: the plugins.
         weighting: how confidence and uncertainty become weights.
         clock: where the time of each part is added up.
+        published: similarities are the raw cosine, whatever `weighting` says.
     """
 
     def __init__(
-        self, store: KeyframeStore, parts: Parts, weighting: WeightingConfig, clock: Stopwatch
+        self,
+        store: KeyframeStore,
+        parts: Parts,
+        weighting: WeightingConfig,
+        clock: Stopwatch,
+        published: bool = False,
     ) -> None:
         self.store = store
         self.parts = parts
         self.weighting = weighting
         self.clock = clock
+        self._calibrate = (
+            weighting.similarity == "matched"
+            and not published
+            and not getattr(parts.features, "calibrated", False)
+        )
         self.iterations = 0
         self.reports: dict[str, int] = {}
         self.cost = float("nan")
@@ -232,6 +243,7 @@ class Optimiser:
             confidence=blank if confidence is None else confidence,
             frames=torch.tensor(list(frames), dtype=torch.int64, device=store.device),
             iteration=self.iterations,
+            calibrate=self._calibrate,
         )
 
     def _learn(

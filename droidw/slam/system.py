@@ -103,7 +103,9 @@ class SlamSystem:
             device,
             getattr(parts.features, "dtype", torch.float32),
         )
-        self.optimiser = Optimiser(self.store, parts, config.weighting, self.clock)
+        self.optimiser = Optimiser(
+            self.store, parts, config.weighting, self.clock, "droid-w" in config.compat
+        )
         self.frontend = Frontend(self.optimiser, config)
         # Keyframes forced by a count depend on which the window has kept: nothing runs ahead then.
         ahead = threaded and config.motion_filter.force_every == 0

@@ -101,6 +101,10 @@ def _run(subject: Subject, part: Any, channels: int, dtype: torch.dtype, label: 
             math.isfinite(report.energy) and all(math.isfinite(v) for v in report.facts.values()),
             "a number in the report of update is not finite",
         )
+    calibrated = dataclasses.replace(view, calibrate=True, iteration=2)
+    with subject.calling("update with calibrated similarities"):
+        part.update(calibrated)
+    _maps(subject, view, "after an update with calibrated similarities")
     blind = dataclasses.replace(view, confidence=torch.zeros_like(view.confidence), iteration=2)
     with subject.calling("update without any confidence"):
         part.update(blind)
@@ -144,15 +148,15 @@ def _state(subject: Subject) -> None:
     with subject.calling("append, update, state_dict and load_state_dict"):
         for index in range(_N):
             first.append(_without_edges(view), index)
-        first.update(view)
+        first.update(dataclasses.replace(view, calibrate=True))
         copied = dataclasses.replace(
             view,
             uncertainty=view.uncertainty.clone(),
             fields={name: value.clone() for name, value in view.fields.items()},
         )
         second.load_state_dict(snapshot(first.state_dict()))
-        first.update(dataclasses.replace(view, iteration=1))
-        second.update(dataclasses.replace(copied, iteration=1))
+        first.update(dataclasses.replace(view, calibrate=True, iteration=1))
+        second.update(dataclasses.replace(copied, calibrate=True, iteration=1))
     subject.expect(
         "state",
         same(view.uncertainty, copied.uncertainty),

@@ -44,6 +44,7 @@ class CnnFeatures:
     Attributes:
         dim: channels of the result.
         dtype: of the result, in which keyframes keep it.
+        calibrated: whether the cosine of its features is on droidw's scale as it is.
         weights_sha256: of the weights file, for the manifest.
     Raises:
         ConfigError: taps or their weights make no sense.
@@ -79,6 +80,7 @@ class CnnFeatures:
             self._rows = rows = max(options.channels - extra, 1)
         self.dim = rows + extra
         self.dtype: torch.dtype = getattr(torch, options.dtype)
+        self.calibrated = options.calibration == "picture"
         self._fixed: Calibration | None = None
         self._default = from_weights(
             self._trunk.statistics,

@@ -33,8 +33,8 @@ class PatchOptions:
     calibration: Literal["none", "picture"] = field(
         default="none",
         metadata={
-            "help": "none: raw features, as published; picture: whitened by mean and spread of "
-            "the first picture that is not blank"
+            "help": "none: features as published (weighting.similarity brings their cosine to "
+            "scale); picture: whitened by mean and spread of the first picture that is not blank"
         },
     )
     shrinkage: float = field(

@@ -33,7 +33,8 @@ class CnnOptions:
         default="picture",
         metadata={
             "help": "where mean and spread of the features come from: the first picture that is "
-            "not blank, shrunk towards the weights; the batch normalisation in the weights; none"
+            "not blank, shrunk towards the weights; the batch normalisation in the weights; none "
+            "(with the last two, weighting.similarity brings the cosine to scale)"
         },
     )
     shrinkage: float = field(

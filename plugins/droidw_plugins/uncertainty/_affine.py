@@ -120,12 +120,17 @@ class AffineSoftplus:
         return theta
 
     def state_dict(self) -> dict[str, Any]:
-        """`theta` [C+1] (weights, then bias), or an empty dict before the first keyframe."""
-        return {} if self._theta is None else {"theta": self._theta.clone()}
+        """`theta` [C+1] (weights, then bias), or an empty dict before the first keyframe.
+
+        Where similarities are calibrated, also what `MatchScale.state_dict` gives.
+        """
+        scale = self._objective.scale.state_dict()
+        return {} if self._theta is None else {"theta": self._theta.clone(), **scale}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore `state_dict()`."""
         self._objective.forget()
+        self._objective.scale.load_state_dict(state)
         self._mapped = None
         self._theta = state["theta"].clone().to(self._device) if state else None
 

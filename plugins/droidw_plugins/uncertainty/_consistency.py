@@ -10,6 +10,7 @@ from torch import Tensor
 from droidw.errors import ConfigError
 from droidw.interfaces.uncertainty import StoreField, UncertaintyReport, UncertaintyView
 from droidw_plugins.uncertainty import _objective as objective
+from droidw_plugins.uncertainty._matches import MatchScale, matches
 from droidw_plugins.uncertainty._native import Kernels, load_kernels
 from droidw_plugins.uncertainty._options import ObjectiveOptions
 from droidw_plugins.uncertainty._published import Publisher
@@ -61,6 +62,7 @@ class Consistency:
             lengths [h,w]: bringing a window into that order at every step would cost more than
             the step. With `tolerance` also a serial number of the keyframe, and those of `maps`.
         maps: writes what was learned.
+        scale: of similarities, found where the view asks for it; belongs to the state of a model.
     """
 
     def __init__(self, options: ObjectiveOptions, device: torch.device, name: str) -> None:
@@ -77,6 +79,7 @@ class Consistency:
             fields += [StoreField(_ROWS, ("h", "w", "c")), StoreField(_LENGTHS, ("h", "w"))]
         if options.tolerance > 0:
             fields.append(StoreField(_SERIAL, (), dtype="int64"))
+        self.scale = MatchScale()
         self.maps = Publisher(options)
         self.fields = (*fields, *self.maps.fields)
 
@@ -167,6 +170,12 @@ class Consistency:
             cosine = self._renewed(view, samples, ii, jj, first, last)
         else:
             cosine = self._similarity(view, samples, first, last)
+        if view.calibrate:
+            measured = matches(view, used, first)
+            if measured is not None:
+                at, weight = measured
+                self.scale.look(self._similarity(view, at, first, last), weight)
+            cosine = self.scale(cosine)
         if options.bulk > 0:
             cosine = objective.calibrated(cosine, samples, options.bulk)
         rho = objective.residual(

@@ -126,13 +126,19 @@ class Mlp:
         state["weights"].mul_(1.0 - options.weight_decay).addcdiv_(mean, root, value=-rate)
 
     def state_dict(self) -> dict[str, Any]:
-        """`weights`, and `mean`, `square` and `steps` of Adam; empty before the first keyframe."""
-        return {name: value.clone() for name, value in self._state.items()}
+        """`weights`, and `mean`, `square` and `steps` of Adam; empty before the first keyframe.
+
+        Where similarities are calibrated, also what `MatchScale.state_dict` gives.
+        """
+        own = {name: value.clone() for name, value in self._state.items()}
+        return {**own, **(self._objective.scale.state_dict() if own else {})}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore `state_dict()`."""
         self._objective.forget()
-        self._state = {name: value.clone().to(self._device) for name, value in state.items()}
+        self._objective.scale.load_state_dict(state)
+        own = {name: value for name, value in state.items() if name != "matches"}
+        self._state = {name: value.clone().to(self._device) for name, value in own.items()}
 
     def _layers(self, view: UncertaintyView) -> Layers:
         """Parameters, made at the first call: N(0, 1/C) and `init_scale` N(0, 1/H), biases 0."""

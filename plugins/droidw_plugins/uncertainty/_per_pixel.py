@@ -19,7 +19,7 @@ class PerPixel:
     """The maps themselves are the parameters: `u <- clamp(u - lr J)` (REFERENCE 4.3).
 
     They live in the store and so move and die with their keyframe; the model has no state of its
-    own.
+    own but the scale of similarities.
 
     Args:
         options: see `PerPixelOptions`.
@@ -66,9 +66,10 @@ class PerPixel:
         return report
 
     def state_dict(self) -> dict[str, Any]:
-        """An empty state: all is in the store."""
-        return {}
+        """What `MatchScale.state_dict` gives; all else is in the store."""
+        return self._objective.scale.state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Nothing to restore; what was kept from earlier steps is dropped."""
+        """Restore `state_dict()`; what was kept from earlier steps is dropped."""
         self._objective.forget()
+        self._objective.scale.load_state_dict(state)
