@@ -342,7 +342,7 @@ class Rectifier:
         bottom, right = self._top + self.camera.height, self._left + self.camera.width
         return picture[self._top : bottom, self._left : right]
 
-    def rectify_mask(self, mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    def rectify_mask(self, mask: npt.NDArray[np.bool_], name: str = "") -> npt.NDArray[np.bool_]:
         """The mask [h,w] bool that lies on the working picture, from one of any size.
 
         A mask of the working size is taken as it is; any other is enlarged or reduced to the raw
@@ -357,9 +357,9 @@ class Rectifier:
         stretch = (width / height) / (self.raw.width / self.raw.height)
         if not 0.98 < stretch < 1.02:
             raise InputError(
-                f"a mask of {width}x{height} pixels does not fit pictures of "
-                f"{self.raw.width}x{self.raw.height} pixels",
-                "masks may be of any size, but must show the whole picture",
+                f"a mask of {width}x{height} pixels{name and f' (picture {name})'} does not fit "
+                f"pictures of {self.raw.width}x{self.raw.height} pixels",
+                "masks may be of any size, but must show the whole picture: --masks DIR",
             )
         out = np.ascontiguousarray(mask, dtype=np.uint8)
         if self._maps is not None:
@@ -376,13 +376,7 @@ class Rectifier:
         """
         image = torch.from_numpy(self.rectify_image(raw.image))
         planes = image.permute(2, 0, 1).to(torch.float32).div_(255.0).contiguous()
-        ignored = None
-        if mask is not None:
-            try:
-                ignored = torch.from_numpy(self.rectify_mask(mask))
-            except InputError as error:
-                said = f"the mask of picture {raw.index} ('{raw.name}'): {error.message}"
-                raise InputError(said, f"{error.hint}: --masks DIR") from error
+        ignored = None if mask is None else torch.from_numpy(self.rectify_mask(mask, raw.name))
         return Frame(raw.index, raw.time, planes, self.camera.intrinsics(), raw.name, ignored)
 
 
