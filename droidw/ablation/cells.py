@@ -168,7 +168,7 @@ def _wants_gpu(resolved: ResolvedConfig) -> bool:
     device = resolved.config.device
     if device != "auto":
         return device.startswith("cuda")
-    if "cuda" not in resolved.devices:
+    if not resolved.suits_gpu:
         return False
     import torch
 

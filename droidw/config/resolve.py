@@ -59,6 +59,18 @@ class ResolvedConfig:
     preset: str | None = None
     origins: Mapping[str, Entry] = field(default_factory=dict)
 
+    @property
+    def suits_gpu(self) -> bool:
+        """Whether `device: auto` takes a GPU that is there: all parts run on one, none by the host.
+
+        A part with the capability "host" takes tensors of a GPU and computes on the processor all
+        the same; a run around it is kept on the processor unless another part runs on a GPU only.
+        """
+        if "cuda" not in self.devices:
+            return False
+        by_host = any("host" in part.capabilities for part, _ in self.parts.values())
+        return not (by_host and "cpu" in self.devices)
+
     def to_yaml(self) -> str:
         """A file that can be run again and resolves to the same configuration."""
         lines = ["# Resolved configuration of a run; it can be run again and means the same."]
@@ -137,7 +149,7 @@ def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
             listed[section].append((part, options))
     if problems:
         raise _joined(problems, loaded)
-    devices = _check_fit(config, parts, loaded)
+    devices = _check_fit(config, parts, loaded, plugins)
     return ResolvedConfig(
         config,
         parts,
@@ -278,7 +290,7 @@ def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
 
 
 def _check_fit(
-    config: DroidwConfig, parts: Mapping[str, Part], loaded: LoadedConfig
+    config: DroidwConfig, parts: Mapping[str, Part], loaded: LoadedConfig, plugins: Plugins
 ) -> frozenset[str]:
     """Whether the parts fit each other and the device; returns the devices they share."""
     model, extractor = parts["uncertainty"][0], parts["features"][0]
@@ -298,7 +310,7 @@ def _check_fit(
             raise ConfigError(
                 f"{loaded.at('device')}: {slot} '{part.name}' does not run on {wanted}",
                 f"it runs on: {', '.join(sorted(able)) or 'no device that it names'}; "
-                f"choose another part ({slot}=NAME) or device",
+                f"choose another device, or {_running_on(plugins, slot, wanted)}",
             )
         if not devices & able:
             others = ", ".join(f"{s} '{parts[s][0].name}'" for s in _ON_DEVICE if s != slot)
@@ -309,6 +321,16 @@ def _check_fit(
             )
         devices &= able
     return devices
+
+
+def _running_on(plugins: Plugins, slot: str, device: str) -> str:
+    """What to write for a part of a kind that runs on a device."""
+    fit = {
+        entry.component.name
+        for entry in plugins.entries()
+        if entry.kind == slot and device in entry.component.capabilities
+    }
+    return " or ".join(f"{slot}={name}" for name in sorted(fit)) or f"another part ({slot}=NAME)"
 
 
 def _plain(value: Any) -> Any:

@@ -75,9 +75,11 @@ class Component(Generic[T]):
         weights: files that must be on disk (`droidw weights list`): records, or bare names of
             what another part describes; or, where it depends on the options, a function of them
             that returns such a tuple (`weights_for` asks).
-        capabilities: facts that the host checks before a run: "cpu", "cuda" (devices it runs
-            on), "features" (an uncertainty model that needs features, an extractor that gives
-            them), "depth" (a depth prior that gives depth).
+        capabilities: facts that the host checks before a run: "cpu", "cuda" (devices whose tensors
+            it takes and gives), "host" (it computes on the processor on either, so that
+            `device: auto` has no reason for a GPU), "threads" (see `Correspondence.motion`),
+            "features" (an uncertainty model that needs features, an extractor that gives them),
+            "depth" (a depth prior that gives depth).
         reference: paper, equation or table row, and the licence of code and weights.
         available: None, or a check that returns "" when the part can run here and a short
             reason such as "no GPU visible" when not; it may be slow and is called lazily.

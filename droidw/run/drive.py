@@ -363,10 +363,10 @@ class _Run:
 
 
 def _device(resolved: ResolvedConfig) -> torch.device:
-    """The device of the run; `auto` takes a GPU if every part can use it."""
+    """The device of the run; `auto` takes a GPU if every part makes use of it."""
     wanted = resolved.config.device
     if wanted == "auto":
-        usable = torch.cuda.is_available() and "cuda" in resolved.devices
+        usable = resolved.suits_gpu and torch.cuda.is_available()
         return torch.device("cuda" if usable else "cpu")
     device = torch.device(wanted)
     if device.type == "cuda" and not torch.cuda.is_available():

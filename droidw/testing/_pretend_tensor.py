@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     from droidw.testing.pretend_gpu import PretendGpu
 
-__all__ = ["GPU", "PretendTensor"]
+__all__ = ["GPU", "PretendTensor", "each_tensor"]
 
 GPU = torch.device("cuda", 0)
 """The device that is pretended."""
@@ -104,6 +105,17 @@ class PretendTensor(Tensor):
 
     def __format__(self, spec: str) -> str:
         return format(self.item(), spec) if self.dim() == 0 else repr(self)
+
+
+def each_tensor(change: Callable[[Tensor], Any], values: Any) -> Any:
+    """Arguments or results of an operation with `change` made of every tensor in them."""
+    if isinstance(values, Tensor):
+        return change(values)
+    if isinstance(values, (list, tuple)):
+        return type(values)([each_tensor(change, v) for v in values])
+    if isinstance(values, dict):
+        return {k: each_tensor(change, v) for k, v in values.items()}
+    return values
 
 
 def _without_lists(index: Any) -> Any:

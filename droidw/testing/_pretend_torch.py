@@ -11,10 +11,9 @@ from unittest import mock
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-from torch.utils._pytree import tree_map_only
 
 from droidw.testing._pretend_streams import Streams
-from droidw.testing._pretend_tensor import GPU, PretendTensor
+from droidw.testing._pretend_tensor import GPU, PretendTensor, each_tensor
 
 __all__ = ["Autocast", "cuda_module", "stand_ins"]
 
@@ -41,7 +40,7 @@ class Autocast:
         dtype = self.dtype
         if dtype is None:
             return values
-        return tree_map_only(Tensor, lambda t: t.to(dtype) if t.dtype in _FLOATS else t, values)
+        return each_tensor(lambda t: t.to(dtype) if t.dtype in _FLOATS else t, values)
 
     def _stack(self) -> list[torch.dtype | None]:
         found: list[torch.dtype | None] = self._local.__dict__.setdefault("stack", [])

@@ -21,10 +21,9 @@ from unittest import mock
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_map_only
 
 from droidw.testing._pretend_streams import Streams
-from droidw.testing._pretend_tensor import GPU, PretendTensor
+from droidw.testing._pretend_tensor import GPU, PretendTensor, each_tensor
 from droidw.testing._pretend_torch import Autocast, cuda_module, stand_ins
 
 __all__ = ["GPU", "PretendGpu", "PretendTensor"]
@@ -113,9 +112,8 @@ class PretendGpu:
             return tensor
 
         asked = kwargs.get("device")
-        plain, named = tree_map_only(
-            Tensor, unwrap, (args, {k: v for k, v in kwargs.items() if k != "device"})
-        )
+        plain = each_tensor(unwrap, args)
+        named = each_tensor(unwrap, {k: v for k, v in kwargs.items() if k != "device"})
         if not there and (asked is None or asked.type != "cuda"):
             return func(*args, **kwargs)
         if any(tensor.is_meta for tensor in here):
@@ -142,7 +140,7 @@ class PretendGpu:
                     func(*args, **kwargs)
             return wrapper
 
-        wrapped = tree_map_only(Tensor, wrap, out)
+        wrapped = each_tensor(wrap, out)
         self.streams.written(made, changed=func._schema.is_mutable)
         return wrapped
 

@@ -160,8 +160,8 @@ def test_no_gpu(run, monkeypatch):
     import torch
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    code, _, wrong, _ = run("synthetic", "--device", "cuda")
-    assert code == 2 and "'flow' does not run on cuda" in wrong
+    code, _, wrong, _ = run("synthetic", "--device", "cuda", "ba=native")
+    assert code == 2 and "'native' does not run on cuda" in wrong
     code, _, wrong, _ = run("synthetic", "--device", "cuda", "correspondence=synthetic")
     assert code == 5
     assert "no GPU is visible" in wrong

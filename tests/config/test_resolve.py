@@ -100,7 +100,7 @@ PHASES = ", ".join(DroidwConfig().schedule)
          "device: 'gpu' is not a device\n  valid: auto, cpu, cuda, cuda:0, cuda:1, ..."),
         ("device=cuda",
          "device: correspondence 'flow' does not run on cuda\n  it runs on: cpu; choose another "
-         "part (correspondence=NAME) or device"),
+         "device, or correspondence=net"),
         ("compat=[droidw]",
          "compat: no published behaviour is called 'droidw'\n  did you mean 'droid-w'?   "
          "valid: droid-w"),

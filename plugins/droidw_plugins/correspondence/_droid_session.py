@@ -158,7 +158,7 @@ class DroidSession:
         """Damping and mask of these sources from what their edges gathered."""
         owner, update = self._owner, self._owner.net.update
         # A product with shares, not a scattered sum: the same result every time on a GPU too.
-        share = torch.nn.functional.one_hot(which, len(nodes)).t().float()
+        share = (which == torch.arange(len(nodes), device=which.device)[:, None]).float()
         share = share / share.sum(dim=1, keepdim=True)
         rows = gathered.permute(0, 2, 3, 1).flatten(1).float()
         mean = (share @ rows).view(-1, *gathered.shape[2:], 128).permute(0, 3, 1, 2)

@@ -77,7 +77,7 @@ COMPONENT: Component[Correspondence] = Component(
     factory=_build,
     options=FlowOptions,
     requires=("cv2",),
-    capabilities=frozenset({"cpu", "threads"}),
+    capabilities=frozenset({"cpu", "cuda", "host", "threads"}),
     reference="Kroeger et al., Fast Optical Flow using Dense Inverse Search, ECCV 2016; "
     "OpenCV's implementation (Apache-2.0)",
 )
