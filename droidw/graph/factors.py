@@ -7,6 +7,8 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
+from droidw.geometry.transfer import on_device
+
 __all__ = ["FactorGraph"]
 
 
@@ -120,14 +122,15 @@ class FactorGraph:
     def index(self, rows: Sequence[int]) -> tuple[Tensor, Tensor]:
         """(ii, jj) of these rows as int64 tensors."""
         device = self.target.device
-        ii = torch.tensor([self.ii[r] for r in rows], dtype=torch.int64, device=device)
-        jj = torch.tensor([self.jj[r] for r in rows], dtype=torch.int64, device=device)
-        return ii, jj
+        return (
+            on_device([self.ii[r] for r in rows], device),
+            on_device([self.jj[r] for r in rows], device),
+        )
 
     def _keep(self, rows: list[int]) -> None:
         for name in ("ids", "ii", "jj", "age", "active"):
             values = getattr(self, name)
             setattr(self, name, [values[row] for row in rows])
-        chosen = torch.tensor(rows, dtype=torch.int64, device=self.target.device)
+        chosen = on_device(rows, self.target.device)
         self.target = self.target[chosen]
         self.confidence = self.confidence[chosen]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["StoreField", "UncertaintyModel", "UncertaintyReport", "UncertaintyView"]
+__all__ = ["Indices", "StoreField", "UncertaintyModel", "UncertaintyReport", "UncertaintyView"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,15 @@ class StoreField:
 
 
 @dataclass(frozen=True)
+class Indices:
+    """Edges (ii[n], jj[n]) and frames on the host."""
+
+    ii: Sequence[int]
+    jj: Sequence[int]
+    frames: Sequence[int]
+
+
+@dataclass(frozen=True)
 class UncertaintyView:
     """What a model may see: views into the keyframe store and the current edges.
 
@@ -42,6 +51,7 @@ class UncertaintyView:
         target: [E,h,w,2] measured correspondence in cells; confidence: [E,h,w,2].
         frames: [K] int64 keyframes whose maps are to be refreshed.
         iteration: counts updates since the start of the run.
+        host: `ii`, `jj` and `frames` once more as lists; see `indices`.
         calibrate: similarities of these features are to be brought to the scale on which
             thresholds are meant (docs/features.md); false: their cosine is taken as it is.
     """
@@ -59,6 +69,13 @@ class UncertaintyView:
     frames: Tensor
     iteration: int = 0
     calibrate: bool = False
+    host: Indices | None = None
+
+    def indices(self) -> Indices:
+        """`ii`, `jj` and `frames` as lists, without asking a GPU if the core has given them."""
+        if self.host is not None:
+            return self.host
+        return Indices(self.ii.tolist(), self.jj.tolist(), self.frames.tolist())
 
 
 @dataclass(frozen=True)

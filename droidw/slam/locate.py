@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from droidw.geometry.projective import depth_there, reproject
+from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.solve.problem import BAProblem
 from droidw.solve.weights import residual_weights
@@ -50,9 +51,9 @@ def locate(
     nodes = [store.payload(k) for k in used] + payloads
     pairs = [(local[k], len(used) + f) for f, ks in enumerate(sources) for k in ks]
     device = store.device
-    ii = torch.tensor([i for i, _ in pairs], dtype=torch.int64, device=device)
-    jj = torch.tensor([j for _, j in pairs], dtype=torch.int64, device=device)
-    at = torch.tensor(used, dtype=torch.int64, device=device)
+    sources_of, targets_of = [i for i, _ in pairs], [j for _, j in pairs]
+    ii, jj = on_device(sources_of, device), on_device(targets_of, device)
+    at = on_device(used, device)
     T_cw = torch.cat([store.T_cw[at], start])
     blank = store.disps.new_ones(len(payloads), *store.disps.shape[1:])
     disps = torch.cat([store.disps[at], blank])
@@ -66,7 +67,7 @@ def locate(
         with optimiser.clock(f"{label}: correspondence"):
             ids = list(range(len(pairs)))
             answer = session.update(
-                EdgeRequest(ids, ii.tolist(), jj.tolist(), coords, valid, payload)
+                EdgeRequest(ids, sources_of, targets_of, coords, valid, payload)
             )
         weight = residual_weights(
             answer.confidence,
@@ -94,6 +95,7 @@ def locate(
                     lm=solver.lm,
                     ep=solver.ep,
                     huber=solver.huber or None,
+                    pairs=pairs,
                 )
                 T_cw = optimiser.parts.ba.step(problem).T_cw
     return T_cw[len(used) :]

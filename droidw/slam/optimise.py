@@ -11,8 +11,9 @@ import torch
 from torch import Tensor
 
 from droidw.geometry.projective import reproject
+from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
-from droidw.interfaces.uncertainty import UncertaintyView
+from droidw.interfaces.uncertainty import Indices, UncertaintyView
 from droidw.solve.problem import BAProblem, Report
 from droidw.solve.weights import gate, residual_weights
 
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Optimiser", "Parts"]
 
+Edges = Sequence[tuple[int, int]]
+
 
 @dataclass(frozen=True)
 class Parts:
@@ -39,6 +42,16 @@ class Parts:
     uncertainty: UncertaintyModel
     ba: BundleAdjuster
     correspondence: Correspondence
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Edges between keyframes that are counted from `low`, on the device and on the host."""
+
+    low: int
+    ii: Tensor
+    jj: Tensor
+    pairs: list[tuple[int, int]]
 
 
 class Optimiser:
@@ -94,11 +107,11 @@ class Optimiser:
         )
         with self.clock("correspondence"):
             answer = session.update(request)
-        at = torch.tensor(rows, dtype=torch.int64, device=graph.target.device)
+        at = on_device(rows, store.device)
         graph.target[at] = answer.target
         graph.confidence[at] = answer.confidence
         if answer.damping is not None and answer.sources is not None:
-            store["damping"][answer.sources] = answer.damping
+            store["damping"][on_device(answer.sources, store.device)] = answer.damping
 
     def update(
         self,
@@ -139,21 +152,23 @@ class Optimiser:
         if not rows:
             return
         ii, jj = graph.index(rows)
-        at = torch.tensor(rows, dtype=torch.int64, device=graph.target.device)
+        at = on_device(rows, graph.target.device)
+        edges = [(graph.ii[r], graph.jj[r]) for r in rows]
+        low = min(min(edge) for edge in edges)
+        used = _Edges(low, ii - low, jj - low, [(i - low, j - low) for i, j in edges])
         everything = len(rows) == len(graph)
         target = graph.target if everything else graph.target[at]
         confidence = graph.confidence if everything else graph.confidence[at]
         for _ in range(phase.iterations):
             with self.clock("bundle"):
-                self._step(ii, jj, target, confidence, phase, solver, first_free)
+                self._step(used, target, confidence, phase, solver, first_free)
             if phase.learn:
                 with self.clock("uncertainty"):
-                    self._learn(ii, jj, target, confidence, first_free)
+                    self._learn(ii, jj, edges, target, confidence, first_free)
 
     def _step(
         self,
-        ii: Tensor,
-        jj: Tensor,
+        edges: _Edges,
         target: Tensor,
         confidence: Tensor,
         phase: PhaseConfig,
@@ -162,14 +177,14 @@ class Optimiser:
     ) -> None:
         """One Gauss-Newton step on the part of the store that the edges touch."""
         store, weighting = self.store, self.weighting
-        low = int(torch.minimum(ii.min(), jj.min()))
+        low = edges.low
         gates = self.gates(low, learned=phase.weigh)
         weight = residual_weights(
             confidence,
             None,
             gates,
-            ii - low,
-            jj - low,
+            edges.ii,
+            edges.jj,
             target,
             bidirectional=weighting.bidirectional,
             scale=weighting.confidence_scale,
@@ -180,8 +195,8 @@ class Optimiser:
             T_cw=store.T_cw[low:],
             disps=store.disps[low:],
             intrinsics=store.intrinsics,
-            ii=ii - low,
-            jj=jj - low,
+            ii=edges.ii,
+            jj=edges.jj,
             target=target,
             weight=weight,
             fixed=fixed,
@@ -194,6 +209,7 @@ class Optimiser:
             guard=solver.guard,
             min_disp=weighting.min_disp,
             max_disp=weighting.max_disp or None,
+            pairs=edges.pairs,
         )
         step = self.parts.ba.step(problem)
         self._note(step.report)
@@ -225,9 +241,13 @@ class Optimiser:
         target: Tensor | None = None,
         confidence: Tensor | None = None,
         frames: Sequence[int] = (),
+        edges: Edges = (),
     ) -> UncertaintyView:
-        """What the uncertainty model sees of the store and of these edges."""
+        """What the uncertainty model sees of the store and of these edges, `edges` on the host."""
         store = self.store
+        host = None
+        if ii is None or edges:
+            host = Indices([i for i, _ in edges], [j for _, j in edges], list(frames))
         none = torch.zeros(0, dtype=torch.int64, device=store.device)
         blank = store.disps.new_zeros(0, store.grid.height, store.grid.width, 2)
         return UncertaintyView(
@@ -241,16 +261,23 @@ class Optimiser:
             jj=none if jj is None else jj,
             target=blank if target is None else target,
             confidence=blank if confidence is None else confidence,
-            frames=torch.tensor(list(frames), dtype=torch.int64, device=store.device),
+            frames=on_device(list(frames), store.device),
+            host=host,
             iteration=self.iterations,
             calibrate=self._calibrate,
         )
 
     def _learn(
-        self, ii: Tensor, jj: Tensor, target: Tensor, confidence: Tensor, first_free: int
+        self,
+        ii: Tensor,
+        jj: Tensor,
+        edges: Edges,
+        target: Tensor,
+        confidence: Tensor,
+        first_free: int,
     ) -> None:
-        frames = sorted(set(ii.tolist()) | set(range(first_free, len(self.store))))
-        report = self.parts.uncertainty.update(self.view(ii, jj, target, confidence, frames))
+        frames = sorted({i for i, _ in edges} | set(range(first_free, len(self.store))))
+        report = self.parts.uncertainty.update(self.view(ii, jj, target, confidence, frames, edges))
         self.iterations += 1
         if not math.isfinite(report.energy):
             self.reports["uncertainty"] = self.reports.get("uncertainty", 0) + 1

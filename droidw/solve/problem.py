@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 if TYPE_CHECKING:
+    import numpy.typing as npt
     from torch import Tensor
 
 __all__ = ["BAProblem", "Report", "Step"]
@@ -36,6 +40,8 @@ class BAProblem:
         min_disp, max_disp: bounds of the disparity after the step (max None: unbounded).
         guard: evaluate the energy after the step; shorten the step while it rose, and reject it
             if no shorter one lowers the energy.
+        pairs: the same edges (i, j) once more on the host, where the caller has them: a backend
+            that needs them there would have to wait for a GPU.
     """
 
     T_cw: Tensor
@@ -56,6 +62,14 @@ class BAProblem:
     min_disp: float = 1e-5
     max_disp: float | None = None
     guard: bool = False
+    pairs: Sequence[tuple[int, int]] | None = None
+
+    def edges(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """`ii` and `jj` on the host, [E] each."""
+        if self.pairs is None:
+            return self.ii.cpu().numpy(), self.jj.cpu().numpy()
+        both = np.asarray(self.pairs, dtype=np.int64).reshape(-1, 2)
+        return both[:, 0], both[:, 1]
 
 
 @dataclass(frozen=True)

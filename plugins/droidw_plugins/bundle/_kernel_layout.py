@@ -13,6 +13,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from droidw.geometry.transfer import on_device, upload
+
 __all__ = ["KernelLayout", "TilePlan", "make_kernel_layout"]
 
 Ints = npt.NDArray[np.int64]
@@ -93,7 +95,11 @@ class KernelLayout:
 
 
 def make_kernel_layout(
-    ii: Tensor, jj: Tensor, frames: int, tiled_from: int = TILED_FROM
+    ii: Tensor,
+    jj: Tensor,
+    frames: int,
+    tiled_from: int = TILED_FROM,
+    host: tuple[Ints, Ints] | None = None,
 ) -> KernelLayout:
     """Sorts the edges [E] and lists which sums belong to which block of the system.
 
@@ -101,11 +107,12 @@ def make_kernel_layout(
         ii, jj: int64, on the device of the step.
         frames: number of frames.
         tiled_from: frames from which on tiles are used.
+        host: the same edges on the host, if they are known there.
 
     Raises:
         ValueError: an edge names a frame that does not exist.
     """
-    src, dst = ii.cpu().numpy(), jj.cpu().numpy()
+    src, dst = (ii.cpu().numpy(), jj.cpu().numpy()) if host is None else host
     for name, index in (("ii", src), ("jj", dst)):
         if index.size and not 0 <= index.min() <= index.max() < frames:
             raise ValueError(f"BAProblem.{name} names a frame outside 0..{frames - 1}")
@@ -168,7 +175,7 @@ def make_kernel_layout(
 def _on_device(named: dict[str, Ints], device: torch.device) -> dict[str, Tensor]:
     """One copy for all arrays; each is a view into it."""
     flat = np.concatenate([np.asarray(a, dtype=np.int64) for a in named.values()])
-    whole = torch.from_numpy(flat).to(device)
+    whole = upload(torch.from_numpy(flat), device)
     sizes = [a.size for a in named.values()]
     return dict(zip(named, torch.split(whole, sizes), strict=True))
 
@@ -229,7 +236,7 @@ def _tile_plan(block_row: Ints, block_col: Ints, frames: int, device: torch.devi
     index = {key: n for n, key in enumerate(keys)}
 
     def ready(values: list[int]) -> Tensor:
-        return torch.tensor(values, dtype=torch.int64, device=device)
+        return on_device(values, device)
 
     columns = []
     for k in range(count):

@@ -53,7 +53,7 @@ class _Scratch:
         e, cells, like = problem.ii.shape[0], h * w, problem.disps
         chunks = chunks_of(cells)
         depth = 0 if problem.motion_only else 1
-        self.layout, self.key = layout, _key(problem)
+        self.layout, self.key, self.pairs = layout, _key(problem), problem.pairs
 
         def full(*shape: int) -> Tensor:
             return torch.empty(*shape, dtype=torch.float64, device=like.device)
@@ -95,9 +95,10 @@ def _key(problem: BAProblem) -> tuple[Any, ...]:
 class KernelStepper:
     """Runs steps with one library; keeps scratch memory and the order of the edges.
 
-    The order is made on the host. As long as the number of edges stays, a step assumes that the
-    edges do, too; the device compares them meanwhile, and the step is made again if it finds
-    others. So one transfer at the end of the step is all that the host waits for.
+    The order is made on the host. Where a problem does not say its edges there (`pairs`), a step
+    assumes that they are those of the step before as long as their number stays; the device
+    compares them meanwhile, and the step is made again if it finds others. So one transfer at the
+    end of the step is all that the host waits for.
 
     Args:
         library: the kernels.
@@ -139,10 +140,12 @@ class KernelStepper:
     def _prepared(self, problem: BAProblem) -> tuple[_Scratch, bool]:
         """Scratch memory that fits, and whether its order was made for these very edges."""
         held, key = self._scratch, _key(problem)
-        if held is not None and held.key == key:
-            return held, False
+        if held is not None and held.key == key and held.pairs == problem.pairs:
+            return held, problem.pairs is not None
         frames = problem.disps.shape[0]
-        layout = make_kernel_layout(problem.ii, problem.jj, frames, self._tiled_from)
+        layout = make_kernel_layout(
+            problem.ii, problem.jj, frames, self._tiled_from, problem.edges()
+        )
         self._scratch = None  # its memory first, so that both need not fit
         self._scratch = _Scratch(problem, layout)
         return self._scratch, True

@@ -8,6 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from droidw.geometry.transfer import upload
+from droidw.solve.problem import BAProblem
+
 __all__ = ["Bucket", "Layout", "Workspace", "make_layout"]
 
 
@@ -56,10 +59,10 @@ class Layout:
     own: Tensor
 
 
-def make_layout(ii: Tensor, jj: Tensor) -> Layout:
+def make_layout(problem: BAProblem) -> Layout:
     """Sorts the edges [E] into buckets; a few microseconds of integer work on the host."""
-    device = ii.device
-    src, dst = ii.cpu().numpy(), jj.cpu().numpy()
+    ii, jj = problem.ii, problem.jj
+    src, dst = problem.edges()
     if src.size == 0:
         return Layout(ii, ii, jj, ii, (), ii, ii, ii)
     count = np.bincount(src)
@@ -84,7 +87,9 @@ def make_layout(ii: Tensor, jj: Tensor) -> Layout:
         )
     pair_a, pair_b = (np.concatenate(side) for side in zip(*pairs, strict=True))
     own = np.flatnonzero(pair_a == pair_b)
-    move = [torch.from_numpy(a).to(device) for a in (order, src, dst, sources, pair_a, pair_b, own)]
+    arrays = (order, src, dst, sources, pair_a, pair_b, own)
+    whole = upload(torch.from_numpy(np.concatenate(arrays)), ii.device)  # one copy for all
+    move = torch.split(whole, [a.size for a in arrays])
     return Layout(move[0], move[1], move[2], move[3], tuple(buckets), *move[4:])
 
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from droidw.geometry import se3
 from droidw.geometry.projective import NEAR, pixel_grid
+from droidw.geometry.transfer import on_device
 from droidw.solve.problem import BAProblem
 from droidw_plugins.bundle._layout import Layout, Workspace
 
@@ -29,6 +30,7 @@ SIGNS = (1.0, 1.0, -1.0, -1.0, 1.0, 1.0)
 # residual. The order lets one pass over both parts fill a row.
 _U_ROWS = (0, 2, 3, 4, 5, 6, 7)
 _V_ROWS = (1, 2, 4, 3, 5, 6, 7)
+_U_SIGNS = (1.0, 1.0, 1.0, 1.0, -1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -113,10 +115,8 @@ def linearise(
         coupling = work.take("coupling", n_edges, 6, n_cells, like=like)
         depth = work.take("depth", n_edges, 2, n_cells, like=like)
     valid = work.take("valid", n_edges, n_cells, like=like) if keep_valid else None
-    u_rows = torch.tensor(_U_ROWS, device=like.device)
-    v_rows = torch.tensor(_V_ROWS, device=like.device)
-    u_signs = torch.ones(7, dtype=torch.float64, device=like.device)
-    u_signs[4] = -1.0
+    u_rows, v_rows = on_device(_U_ROWS, like.device), on_device(_V_ROWS, like.device)
+    u_signs = on_device(_U_SIGNS, like.device, torch.float64)
     t = motions.t.to(like.dtype)
     for c in _project(problem, layout, motions, problem.disps, work, chunk):
         n = c.d.shape[0]
@@ -142,8 +142,8 @@ def energy(
     valid: Tensor,
     work: Workspace,
     chunk: int,
-) -> float:
-    """Robust reprojection energy of other poses and depths, summed in float64.
+) -> Tensor:
+    """Robust reprojection energy of other poses and depths, summed in float64, a scalar tensor.
 
     Counts exactly the cells of `valid`, those that passed the near test at the start of the
     step; one that has come too near since is charged at its clamped depth, so that nothing is
@@ -158,7 +158,7 @@ def energy(
             knee = problem.huber / _length(cells, weight).clamp_(min=problem.huber)
             cells *= knee * (2.0 - knee)  # 1 inside the threshold, (2hs - h^2) / s^2 outside
         total += cells.sum(1).double().sum()
-    return float(total)
+    return total
 
 
 def _length(cells: Tensor, weight: Tensor) -> Tensor:
@@ -183,9 +183,9 @@ def _project(
     like = problem.disps
     h, w = like.shape[-2:]
     n_edges, n_cells = layout.ii.shape[0], h * w
-    fx, fy, cx, cy = problem.intrinsics.tolist()
+    fx, fy, cx, cy = problem.intrinsics.to(like.dtype).unbind()
     # the second coordinate twice: (Y, X, Y, Z) holds both (X, Y) and (Y, X) as runs of planes
-    twice = torch.tensor((1, 0, 1, 2), device=like.device)
+    twice = on_device((1, 0, 1, 2), like.device)
     R, t = motions.R[:, twice].to(like.dtype), motions.t[:, twice].to(like.dtype)
     intrinsics = problem.intrinsics.to(like.dtype)[:, None]
     focal, centre = intrinsics[:2], intrinsics[2:]

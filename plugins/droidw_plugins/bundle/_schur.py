@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from droidw.geometry.transfer import on_device
 from droidw.solve.problem import BAProblem
 from droidw_plugins.bundle._layout import Layout, Workspace
 from droidw_plugins.bundle._linearise import SIGNS, EdgeSums
@@ -51,7 +52,7 @@ def reduce_system(
         S [6F,6F] and right side [6F] in float64, undamped, and the depth system (None if
         depths stay).
     """
-    signs = sums.gram.new_tensor(SIGNS)
+    signs = on_device(SIGNS, sums.gram.device, sums.gram.dtype)
     turn = signs * signs[:, None]
     X = sums.gram[:, :6, :6] * turn
     rhs = sums.gram[:, :6, 7] * signs
@@ -84,8 +85,10 @@ def reduce_system(
     return full.reshape(6 * n_free, 6 * n_free), g[:n_free].reshape(-1), depth
 
 
-def solve_reduced(S: Tensor, g: Tensor, lm: float, ep: float, floor: float) -> Tensor | None:
-    """Solves the damped system by Cholesky, [F,6]; None if it is singular.
+def solve_reduced(
+    S: Tensor, g: Tensor, lm: float, ep: float, floor: float
+) -> tuple[Tensor, Tensor]:
+    """Solves the damped system by Cholesky, [F,6], and says in a scalar whether that went well.
 
     Args:
         lm, ep: diag(S) <- diag(S) * (1 + lm) + ep.
@@ -99,9 +102,8 @@ def solve_reduced(S: Tensor, g: Tensor, lm: float, ep: float, floor: float) -> T
     least = torch.where(added < floor * diagonal, floor * diagonal, torch.zeros_like(added))
     diagonal += added
     L, info = torch.linalg.cholesky_ex(S)
-    if int(info) != 0 or not bool((L.diagonal().square() > least).all()):
-        return None
-    return torch.cholesky_solve(g[:, None], L).view(-1, 6)
+    sound = (info == 0) & (L.diagonal().square() > least).all()
+    return torch.cholesky_solve(g[:, None], L).view(-1, 6), sound
 
 
 def back_substitute(
@@ -114,7 +116,7 @@ def back_substitute(
     """
     assert sums.coupling is not None
     dz = depth.rhs.clone()
-    signs = dx.new_tensor(SIGNS)
+    signs = on_device(SIGNS, dx.device, dx.dtype)
     seen = dx[layout.jj] - (adjoints @ dx[layout.ii, :, None])[..., 0]
     y = (seen * signs).to(dz.dtype)
     for bucket in layout.buckets:
