@@ -3,7 +3,10 @@
 Prints medians of calls made in turn in one process, and their ratio. The first step on given edges
 compares features; the second of the two that follow each other in a run may keep that (`refresh`).
 
-    python benchmarks/uncertainty.py [--threads 1] [--repeats 25] [--json FILE] [--quick]
+    python benchmarks/uncertainty.py [--threads 1] [--repeats 25] [--save] [--json FILE] [--quick]
+
+Steps of `ba=torch` and of `ba=native`, where a compiler is, stand beside; ratios are to the first.
+"matched" also finds the scale of similarities (weighting.similarity), as for all features but cnn.
 """
 
 from __future__ import annotations
@@ -11,19 +14,23 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import platform
 import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from ba_step import make_window
+from end_to_end import RESULTS, machine, today
 
 from droidw.geometry import se3
 from droidw.interfaces.uncertainty import UncertaintyModel, UncertaintyView
 from droidw.plugin.component import BuildContext
 from droidw.solve.problem import BAProblem
+from droidw_plugins.bundle import native_ba
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 from droidw_plugins.uncertainty import affine_softplus, mlp, per_pixel
 
@@ -32,8 +39,11 @@ CHANNELS = 64
 DRIFT = 0.002
 """Translation of all cameras between two updates, as late iterations move them (scene units)."""
 
+CPU_PRESET = {"smooth": 1, "residual_gain": 0.35}
 CASES = (
     ("affine-softplus", affine_softplus.COMPONENT, {}),
+    ("  preset cpu", affine_softplus.COMPONENT, CPU_PRESET),
+    ("  matched", affine_softplus.COMPONENT, {"matched": True}),
     ("  tolerance 0.02", affine_softplus.COMPONENT, {"tolerance": 0.02}),
     ("per-pixel", per_pixel.COMPONENT, {}),
     ("mlp", mlp.COMPONENT, {}),
@@ -46,6 +56,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1, help="threads of torch (default 1)")
     parser.add_argument("--repeats", type=int, default=25, help="calls per median (default 25)")
     parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.add_argument("--save", action="store_true", help="write results/uncertainty.md, .json")
     parser.add_argument("--quick", action="store_true", help="the smallest window only")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
@@ -64,30 +75,66 @@ def main() -> None:
                 f"{row['first_over_ba']:4.2f} {row['second_over_ba']:4.2f}",
                 flush=True,
             )
-    if args.json:
-        record = {
-            "benchmark": "uncertainty",
-            "torch": torch.__version__,
-            "machine": platform.machine(),
-            "threads": args.threads,
-            "repeats": args.repeats,
-            "rows": rows,
-        }
-        args.json.write_text(json.dumps(record, indent=2) + "\n")
+    record = {
+        "benchmark": "uncertainty",
+        "date": today(),
+        "torch": torch.__version__,
+        **machine(),
+        "machine": platform.machine(),
+        "threads": args.threads,
+        "repeats": args.repeats,
+        "rows": rows,
+    }
+    for path in ([args.json] if args.json else []) + (
+        [RESULTS / "uncertainty.json"] if args.save else []
+    ):
+        path.write_text(json.dumps(record, indent=2) + "\n")
+    if args.save:
+        (RESULTS / "uncertainty.md").write_text("\n".join(told(record)) + "\n")
+
+
+def told(record: dict[str, Any]) -> list[str]:
+    """The figures as Markdown."""
+    return [
+        "# One uncertainty update beside one bundle adjustment step",
+        "",
+        f"{record['date']}, {record['cpu']}, {record['cores']} cores, {record['threads']} thread "
+        f"used, no GPU; torch {record['torch']}; load {record['load_average_1min']}; commit "
+        f"{record['commit']}. Made by `python benchmarks/uncertainty.py --save`: median of "
+        f"{record['repeats']} calls in turn, milliseconds of processor time, 30x40 cells, "
+        f"{CHANNELS} channels; in brackets, over that of the step of `ba=torch`.",
+        "",
+        "| keyframes | edges | step: torch | native | model | first | second |",
+        "|---:|---:|---:|---:|---|---|---|",
+        *(
+            f"| {r['keyframes']} | {r['edges']} | {r['ba_ms']:.1f} | "
+            f"{r['native_ms'] or math.nan:.1f} | {r['model'].strip()} | "
+            f"{r['first_ms']:.1f} ({r['first_over_ba']:.2f}) | "
+            f"{r['second_ms']:.1f} ({r['second_over_ba']:.2f}) |"
+            for r in record["rows"]
+        ),
+    ]
 
 
 def measure(keyframes: int, edges: int, repeats: int) -> list[dict[str, object]]:
     """All models and the bundle adjuster in turn on one window; medians."""
     problem = make_window(keyframes, edges, 30, 40, torch.float32)
     adjuster = TorchBundleAdjuster()
+    ready = native_ba.COMPONENT.available is None or not native_ba.COMPONENT.available()
+    native = native_ba.NativeBundleAdjuster() if ready else None
     models = [prepare(component, options, problem) for _, component, options in CASES]
     step: list[float] = []
+    compiled: list[float] = []
     first: list[list[float]] = [[] for _ in CASES]
     second: list[list[float]] = [[] for _ in CASES]
     for count in range(repeats + 1):
         taken = clock(lambda: adjuster.step(problem))
         if count:  # the first round warms up
             step.append(taken)
+        if native is not None:
+            taken = clock(lambda: native.step(problem))
+            if count:
+                compiled.append(taken)
         for n, (model, view) in enumerate(models):
             # Another edge order is another set of edges, so that nothing is kept from before.
             order = torch.arange(edges).roll(count + 1)
@@ -110,6 +157,7 @@ def measure(keyframes: int, edges: int, repeats: int) -> list[dict[str, object]]
             "edges": edges,
             "model": name,
             "ba_ms": ba,
+            "native_ms": statistics.median(compiled) if compiled else None,
             "first_ms": statistics.median(first[n]),
             "second_ms": statistics.median(second[n]),
             "first_over_ba": statistics.median(first[n]) / ba,
@@ -123,6 +171,8 @@ def prepare(
     component: object, options: dict[str, object], problem: BAProblem
 ) -> tuple[UncertaintyModel, UncertaintyView]:
     """A model with `refresh: 2` and a view of the window with smooth random features."""
+    options = dict(options)
+    matched = bool(options.pop("matched", False))
     model = component.factory(  # type: ignore[attr-defined]
         component.options(refresh=2, **options),  # type: ignore[attr-defined]
         BuildContext(torch.device("cpu")),
@@ -152,6 +202,7 @@ def prepare(
         target=problem.target,
         confidence=problem.weight,
         frames=torch.arange(n),
+        calibrate=matched,
     )
     for index in range(n):
         model.append(view, index)

@@ -196,7 +196,7 @@ def test_every_published_row_is_a_row_of_paper():
     for slot, names in {
         "features": {"dinov2", "cnn"},
         "uncertainty": {"per-pixel", "mlp", "none"},
-        "ba": {"torch", "native"},
+        "ba": {"cuda", "torch", "native"},
         "depth": {"none"},
     }.items():
         assert names <= {tree[slot] for tree in rows.values() if isinstance(tree.get(slot), str)}
