@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from droidw.geometry import se3
+from droidw.geometry.transfer import on_device
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,5 +25,8 @@ def interpolate(T_a: Tensor, T_b: Tensor, s: Tensor | float) -> Tensor:
     Returns:
         [..., 7] with unit quaternions.
     """
-    share = torch.as_tensor(s, dtype=T_a.dtype, device=T_a.device)
-    return se3.retract(T_a, share[..., None] * se3.log(se3.mul(T_b, se3.inv(T_a))))
+    if isinstance(s, torch.Tensor):
+        share = s.to(T_a)[..., None]
+    else:
+        share = on_device([s], T_a.device, T_a.dtype)
+    return se3.retract(T_a, share * se3.log(se3.mul(T_b, se3.inv(T_a))))

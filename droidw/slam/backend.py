@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from droidw.geometry.projective import frame_distance
+from droidw.geometry.transfer import upload
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import backend_edges, frontend_edges
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
@@ -113,8 +114,8 @@ class Backend:
                     store.T_cw,
                     store.disps,
                     store.intrinsics,
-                    ii[part].to(store.device),
-                    jj[part].to(store.device),
+                    upload(ii[part], store.device),
+                    upload(jj[part], store.device),
                     options.beta,
                 ).cpu()
             )

@@ -10,6 +10,7 @@ import torch
 
 from droidw.geometry.projective import frame_distance
 from droidw.geometry.se3 import exp, inv, log, mul
+from droidw.geometry.transfer import on_device, upload
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import frontend_edges, neighbour_edges
 from droidw.slam.locate import carry_depth, locate
@@ -222,10 +223,8 @@ class Frontend:
 
     def _distance(self, ii: torch.Tensor, jj: torch.Tensor, beta: float) -> torch.Tensor:
         store = self.store
-        device = store.device
-        return frame_distance(
-            store.T_cw, store.disps, store.intrinsics, ii.to(device), jj.to(device), beta
-        )
+        ii, jj = upload(ii, store.device), upload(jj, store.device)
+        return frame_distance(store.T_cw, store.disps, store.intrinsics, ii, jj, beta)
 
     def _propose(
         self, first_i: int, first_j: int, beta: float, nms: int, retire: bool = False
@@ -270,7 +269,7 @@ class Frontend:
         """
         store = self.store
         count = len(store)
-        identity = store.T_cw.new_tensor([0.0, 0, 0, 0, 0, 0, 1])
+        identity = on_device([0.0, 0, 0, 0, 0, 0, 1], store.device, store.T_cw.dtype)
         if not self.initialised:
             return identity, store.disps.new_ones(store.grid.height, store.grid.width)
         last = store.T_cw[count - 1]

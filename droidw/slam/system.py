@@ -82,8 +82,7 @@ class SlamSystem:
         self.focal: FocalSearch | None = None
         self._focal_known = focal_known
         self.events = events or Dispatcher()
-        wait = torch.cuda.synchronize if device.type == "cuda" else None
-        self.clock = Stopwatch(wait)
+        self.clock = Stopwatch()
         op = parts.correspondence
         self.grid = Grid.of(camera.height, camera.width, op.stride, op.offset)
         # The published code takes depth and features from pixel 8 x + 3, but its rays from 8 x.

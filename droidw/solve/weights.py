@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch.nn import functional as F
 
+from droidw.geometry.transfer import on_device
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -96,7 +98,7 @@ def _gate_at(gates: Tensor, target: Tensor) -> Tensor:
     x, y = target.unbind(-1)
     # A comparison with NaN is false, so that a broken target counts as outside.
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-    size = target.new_tensor([max(width - 1, 1), max(height - 1, 1)])
+    size = on_device([max(width - 1, 1), max(height - 1, 1)], target.device, target.dtype)
     where = torch.where(inside[..., None], target / size * 2 - 1, torch.zeros_like(target))
     found = F.grid_sample(
         gates[:, None], where.to(gates.dtype), padding_mode="border", align_corners=True

@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from droidw.geometry.transfer import on_device
+
 __all__ = ["LEVELS", "RADIUS", "Pyramid", "lookup", "lookup_lowmem", "smallest_side", "volume"]
 
 LEVELS = 4
@@ -110,10 +112,12 @@ def _lookup(
     """Fetch the 8x8 cells around each coordinate at each level, and blend them."""
     count, height, width = coords.shape[:3]
     out = coords.new_empty(count, height, width, LEVELS * _SIDE * _SIDE, dtype=torch.float32)
-    sizes = torch.tensor([[w, h] for h, w in pyramid.sizes], device=coords.device)
+    sizes = on_device([[w, h] for h, w in pyramid.sizes], coords.device)
     columns = sizes[:, 0, None, None]
-    starts = torch.tensor(pyramid.starts, device=coords.device)[:, None, None]
-    scale = coords.new_tensor([2.0**-level for level in range(LEVELS)])[:, None]
+    starts = on_device(pyramid.starts, coords.device)[:, None, None]
+    scale = on_device([2.0**-level for level in range(LEVELS)], coords.device, coords.dtype)[
+        :, None
+    ]
     steps = torch.arange(-RADIUS, RADIUS + 2, device=coords.device)
     together = _TOGETHER["cuda" if coords.is_cuda else "cpu"]
     for first in range(0, count, together):

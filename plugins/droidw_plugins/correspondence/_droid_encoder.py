@@ -6,6 +6,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from droidw.geometry.transfer import on_device
+
 __all__ = ["Encoder", "normalise"]
 
 _MEAN = (0.485, 0.456, 0.406)
@@ -14,8 +16,8 @@ _STD = (0.229, 0.224, 0.225)
 
 def normalise(images: Tensor) -> Tensor:
     """RGB in [0,1], [...,3,H,W], as the encoders take it (REFERENCE 1.1); float32."""
-    mean = images.new_tensor(_MEAN, dtype=torch.float32)[:, None, None]
-    std = images.new_tensor(_STD, dtype=torch.float32)[:, None, None]
+    mean = on_device(_MEAN, images.device, torch.float32)[:, None, None]
+    std = on_device(_STD, images.device, torch.float32)[:, None, None]
     return (images.float() - mean) / std
 
 

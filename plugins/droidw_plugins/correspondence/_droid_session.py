@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from droidw.geometry.projective import pixel_grid
+from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate, Purpose
 from droidw_plugins.correspondence._droid_corr import Pyramid, lookup, lookup_lowmem, volume
 from droidw_plugins.correspondence._droid_net import motion_features, upsample_convex
@@ -81,7 +82,7 @@ class DroidSession:
             return EdgeUpdate(target, confidence)
         found: list[_Sources] = []
         for rows in self._batches(request):
-            at = torch.tensor(rows, device=target.device)
+            at = on_device(rows, target.device)
             target[at], confidence[at], sources = self._round(request, rows, request.coords[at])
             if sources is not None:
                 found.append(sources)
@@ -136,7 +137,7 @@ class DroidSession:
         edges = self._state(request, rows, coords)
         nodes = sorted({request.ii[r] for r in rows})
         row_of = {node: row for row, node in enumerate(nodes)}
-        which = torch.tensor([row_of[request.ii[r]] for r in rows], device=coords.device)
+        which = on_device([row_of[request.ii[r]] for r in rows], coords.device)
         height, width = coords.shape[1:3]
         grid = pixel_grid(height, width, device=coords.device)
         motion = motion_features(coords, torch.stack([e.target for e in edges]), grid)
@@ -215,11 +216,14 @@ class DroidSession:
         pairs = [
             (working(payload(request.ii[rows[n]]).fmap), pooled[request.jj[rows[n]]]) for n in fresh
         ]
-        corr = lookup_lowmem(pairs, coords[fresh], pyramid)
+        at = on_device(fresh, coords.device)
+        corr = lookup_lowmem(pairs, coords[at], pyramid)
         if not kept:
             return corr
         both = corr.new_empty(len(edges), *corr.shape[1:])
-        both[fresh], both[kept] = corr, lookup(volumes, coords[kept], pyramid)
+        both[at] = corr
+        at = on_device(kept, coords.device)
+        both[at] = lookup(volumes, coords[at], pyramid)
         return both
 
     def _stack(self, maps: list[Tensor]) -> Tensor:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from droidw.geometry.transfer import upload
 from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate
 from droidw_plugins.correspondence._flow_types import Array, Edge
 
@@ -44,9 +45,9 @@ class FlowSession:
             return EdgeUpdate(torch.zeros_like(request.coords), torch.zeros_like(request.coords))
         edges = [self._edges[edge_id] for edge_id in request.ids]
         device = request.coords.device
-        target = torch.from_numpy(np.stack([e.target for e in edges])).to(device)
-        confidence = torch.from_numpy(np.stack([e.confidence for e in edges])).to(device)
-        return EdgeUpdate(target, confidence)
+        target = torch.from_numpy(np.stack([e.target for e in edges]))
+        confidence = torch.from_numpy(np.stack([e.confidence for e in edges]))
+        return EdgeUpdate(upload(target, device), upload(confidence, device))
 
     def _astray(self, request: EdgeRequest, coords: Array) -> list[int]:
         """Rows where most confident cells lie far from the prediction of good geometry."""
@@ -86,11 +87,12 @@ class FlowSession:
             i, j = request.ii[row], request.jj[row]
             pairs.setdefault((min(i, j), max(i, j)), {})[i < j] = row
 
+        valid = request.valid.cpu().numpy() if request.informed and wanted else None
+
         def start(row: int | None) -> Array | None:
-            if row is None or not request.informed:
+            if row is None or valid is None:
                 return None
-            valid = request.valid[row].cpu().numpy()
-            return coords[row] if valid.mean() > 0.5 else None
+            return coords[row] if valid[row].mean() > 0.5 else None
 
         def job(key: tuple[int, int], rows: dict[bool, int]) -> Callable[[], Any]:
             a, b = request.payload(key[0]), request.payload(key[1])

@@ -167,12 +167,13 @@ def sample_at_cells(patches: Tensor, size: tuple[int, ...], grid: Grid) -> Tenso
     """
 
     def axis(count: int, cells: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
-        pixel = torch.arange(cells, dtype=torch.float64) * grid.stride + grid.offset
+        pixel = torch.arange(cells, dtype=torch.float64, device=patches.device)
+        pixel = pixel * grid.stride + grid.offset
         where = ((pixel + 0.5) * count / side - 0.5).clamp(0, count - 1)
         low = where.floor().long().clamp_max(max(count - 2, 0))
         high = (low + 1).clamp_max(count - 1)
         share = (where - low).to(patches.dtype)
-        return low.to(patches.device), high.to(patches.device), share.to(patches.device)
+        return low, high, share
 
     low, high, share = axis(patches.shape[1], grid.height, size[0])
     rows = torch.lerp(patches[:, low], patches[:, high], share[:, None])

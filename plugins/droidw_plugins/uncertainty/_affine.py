@@ -12,7 +12,7 @@ from droidw.errors import ConfigError
 from droidw.interfaces.uncertainty import StoreField, UncertaintyReport, UncertaintyView
 from droidw.plugin.component import BuildContext
 from droidw_plugins.uncertainty import _objective as objective
-from droidw_plugins.uncertainty._consistency import Consistency
+from droidw_plugins.uncertainty._consistency import Consistency, Numbers
 from droidw_plugins.uncertainty.affine_softplus import AffineSoftplusOptions
 
 __all__ = ["AffineSoftplus", "affine", "affine_gradient"]
@@ -80,21 +80,21 @@ class AffineSoftplus:
         """One step of gradient descent on the edges of the view (REFERENCE 4.3).
 
         Returns:
-            The report of `Consistency.gradient`, and as a fact `theta_norm`.
+            The report of `Numbers.read`, and as a fact `theta_norm`.
         """
         theta = self._parameters(view)
         if view.frames.numel() == 0:
             return UncertaintyReport()
-        gradient, report = self._objective.gradient(view)
-        theta = self._descend(view, gradient.flatten(1), theta)
-        facts = {**report.facts, "theta_norm": float(theta.norm())}
-        return UncertaintyReport(report.energy, facts)
+        gradient, numbers = self._objective.gradient(view)
+        return self._descend(view, gradient.flatten(1), theta, numbers)
 
-    def _descend(self, view: UncertaintyView, gradient: Tensor, theta: Tensor) -> Tensor:
+    def _descend(
+        self, view: UncertaintyView, gradient: Tensor, theta: Tensor, numbers: Numbers
+    ) -> UncertaintyReport:
         """Move theta along the gradient [F,P] with respect to u, and renew the maps."""
-        options, frames = self._options, view.frames
+        options, frames, known = self._options, view.frames, view.indices().frames
         # Views into the store from the first to the last of the frames: nothing is copied.
-        first, last = int(frames.min()), int(frames.max()) + 1
+        first, last = min(known), max(known) + 1
         rows = self._objective.rows(view, first, last)
         last_map = self._mapped
         if (
@@ -110,14 +110,15 @@ class AffineSoftplus:
         weight[place] = gradient * objective.softplus_slope(y[place], options.softplus_offset)
         step = affine_gradient(weight, rows, options.bias).mul_(self._objective.share(gradient))
         theta = theta - options.lr * step - options.weight_decay * theta
+        report, told = numbers.read(finite=torch.isfinite(theta).all(), norm=theta.norm())
         # A step that is not finite would poison the whole run; the report's energy shows it.
-        if bool(torch.isfinite(theta).all()):
+        if told["finite"]:
             self._theta = theta
             y = affine(rows, theta)
             self._mapped = _Mapped(theta, first, last, y)
             u = objective.softplus(y[place], options.softplus_offset)
             self._objective.maps.write(view, u.view(-1, *view.uncertainty.shape[1:]))
-        return theta
+        return UncertaintyReport(report.energy, {**report.facts, "theta_norm": told["norm"]})
 
     def state_dict(self) -> dict[str, Any]:
         """`theta` [C+1] (weights, then bias), or an empty dict before the first keyframe.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from droidw.errors import ConfigError
+from droidw.geometry.transfer import on_device, upload
 from droidw.interfaces.uncertainty import StoreField, UncertaintyReport, UncertaintyView
 from droidw_plugins.uncertainty import _objective as objective
 from droidw_plugins.uncertainty._matches import MatchScale, matches
@@ -15,7 +16,7 @@ from droidw_plugins.uncertainty._native import Kernels, load_kernels
 from droidw_plugins.uncertainty._options import ObjectiveOptions
 from droidw_plugins.uncertainty._published import Publisher
 
-__all__ = ["Consistency"]
+__all__ = ["Consistency", "Numbers"]
 
 _ROWS = "consistency_rows"
 _LENGTHS = "consistency_lengths"
@@ -26,19 +27,40 @@ _SERIAL = "consistency_serial"
 class _Pairs:
     """Samples and residuals of one set of edges, kept for `refresh` steps.
 
-    `first` and `last` bound the keyframes that take part; rows count from `first`.
+    `first` and `last` bound the keyframes that take part; rows count from `first`. `inside` and
+    `similar` are numbers of pairs, scalars where the run computes.
     """
 
-    ii: Tensor
-    jj: Tensor
+    edges: list[tuple[int, int]]
     first: int
     last: int
     counts: Tensor
     samples: objective.Samples
     rho: Tensor
-    inside: int
-    similar: int
+    inside: Tensor
+    similar: Tensor
     age: int = 0
+
+
+class Numbers:
+    """Numbers of one step that wait to be read, since each reading waits for a GPU."""
+
+    def __init__(self, **scalars: Tensor) -> None:
+        self._scalars = scalars
+
+    def read(self, **more: Tensor) -> tuple[UncertaintyReport, dict[str, float]]:
+        """Read all of them at once, and others.
+
+        Returns:
+            A report of the mean pair energy, and as facts: `pairs`, and `similar`, the share of
+            pairs above the threshold; and the others by name.
+        """
+        scalars = {**self._scalars, **more}
+        told = torch.stack([value.double() for value in scalars.values()]).tolist()
+        found = dict(zip(scalars, told, strict=True))
+        energy, pairs, similar = (found.pop(name) for name in ("energy", "inside", "similar"))
+        some = max(pairs, 1.0)
+        return UncertaintyReport(energy / some, {"pairs": pairs, "similar": similar / some}), found
 
 
 @dataclass(frozen=True)
@@ -118,13 +140,8 @@ class Consistency:
             return view.fields[_ROWS][first:last].flatten(1, 2)
         return view.features[first:last].flatten(2).transpose(1, 2).float()
 
-    def gradient(self, view: UncertaintyView) -> tuple[Tensor, UncertaintyReport]:
-        """J [F,h,w] of REFERENCE 4.3 for the F frames of the view, and the facts of the step.
-
-        Returns:
-            J, and a report of the mean pair energy, and as facts: `pairs`, and `similar`, the
-            share of pairs above the threshold.
-        """
+    def gradient(self, view: UncertaintyView) -> tuple[Tensor, Numbers]:
+        """J [F,h,w] of REFERENCE 4.3 for the F frames of the view, and the facts of the step."""
         options = self.options
         pairs = self._pairs_of(view)
         u = self.maps.learned(view)[pairs.first : pairs.last]
@@ -138,32 +155,35 @@ class Consistency:
         full = objective.frame_gradient(
             pair.view(u.shape), u, counts, options.gamma_data, options.gamma_prior
         )
-        facts = {"pairs": float(pairs.inside), "similar": pairs.similar / max(pairs.inside, 1)}
-        report = UncertaintyReport(float(energy) / max(pairs.inside, 1), facts)
-        return full[view.frames - pairs.first], report
+        numbers = Numbers(energy=energy, inside=pairs.inside, similar=pairs.similar)
+        return full[view.frames - pairs.first], numbers
 
     def share(self, gradient: Tensor) -> float:
         """What the gradient [F,P] of a parameter is multiplied with: a mean, or 1 for the sum."""
         return 1.0 / gradient.numel() if self.options.average else 1.0
 
     def _pairs_of(self, view: UncertaintyView) -> _Pairs:
-        kept = self._pairs
+        kept, known = self._pairs, view.indices()
+        edges = list(zip(known.ii, known.jj, strict=True))
         if (
             kept is not None
             and kept.age + 1 < self.options.refresh
-            and torch.equal(kept.ii, view.ii)
-            and torch.equal(kept.jj, view.jj)
-            and kept.first <= int(view.frames.min())
-            and kept.last > int(view.frames.max())
+            and kept.edges == edges
+            and kept.first <= min(known.frames)
+            and kept.last > max(known.frames)
         ):
             kept.age += 1
             return kept
         options = self.options
-        used = objective.edges_used(view.ii, view.jj, options.min_gap)
-        ii, jj = view.ii[used], view.jj[used]
-        touched = torch.cat([ii, jj, view.frames])
-        first, last = int(touched.min()), int(touched.max()) + 1
-        counts = torch.bincount(torch.cat([ii, jj]) - first, minlength=last - first)
+        pairs = torch.tensor(edges, dtype=torch.int64).view(-1, 2)
+        used = objective.edges_used(pairs[:, 0], pairs[:, 1], options.min_gap)
+        taken = pairs[used]
+        touched = [*taken.flatten().tolist(), *known.frames]
+        first, last = min(touched), max(touched) + 1
+        device = view.disps.device
+        ii, jj = upload(taken[:, 0].contiguous(), device), upload(taken[:, 1].contiguous(), device)
+        counts = torch.bincount(taken.flatten() - first, minlength=last - first)
+        counts = upload(counts, device)
         self.maps.weigh(view)
         samples = self._samples(view, ii, jj, first)
         if options.tolerance > 0:
@@ -181,11 +201,9 @@ class Consistency:
         rho = objective.residual(
             cosine, samples, options.similarity_threshold, options.similarity_floor
         )
-        inside = int(samples.inside.sum())
-        similar = inside - int((rho == 1).sum())
-        self._pairs = _Pairs(
-            view.ii.clone(), view.jj.clone(), first, last, counts, samples, rho, inside, similar
-        )
+        inside = samples.inside.sum()
+        similar = inside - (rho == 1).sum()
+        self._pairs = _Pairs(edges, first, last, counts, samples, rho, inside, similar)
         return self._pairs
 
     def _samples(
@@ -226,8 +244,8 @@ class Consistency:
         taken = self._taken
         if taken is not None:
             known = [n for n, key in enumerate(keys) if key in taken.row]
-            at = torch.tensor([taken.row[keys[n]] for n in known], device=cosine.device).long()
-            here = torch.tensor(known, device=cosine.device).long()
+            at = on_device([taken.row[keys[n]] for n in known], cosine.device)
+            here = on_device(known, cosine.device)
             old = taken.places[at]
             moved[here] = (samples.place[here] - old).abs_().mean((1, 2)) > (
                 0.5 * self.options.tolerance

@@ -19,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from droidw.geometry.transfer import on_device, upload
 from droidw.interfaces.uncertainty import UncertaintyView
 from droidw_plugins.uncertainty import _objective as objective
 
@@ -58,10 +59,13 @@ class MatchScale:
             cosine: of any shape. weight: >= 0, the same shape; 0 where nothing was matched.
         """
         weight = torch.where(torch.isfinite(weight) & torch.isfinite(cosine), weight, 0.0)
-        largest = float(weight.max()) if weight.numel() else 0.0
-        if largest <= 0 or float(weight.sum()) / largest < _ENOUGH:
+        if not weight.numel():
             return
-        quartile, median = weighted_quantiles(1.0 - cosine, weight, (0.75, 0.5)).tolist()
+        quantiles = weighted_quantiles(1.0 - cosine, weight, (0.75, 0.5))
+        told = torch.cat([torch.stack([weight.max(), weight.sum()]).double(), quantiles.double()])
+        largest, total, quartile, median = told.tolist()
+        if largest <= 0 or total / largest < _ENOUGH:
+            return
         if median < _LEAST:
             return
         self.looks += 1
@@ -98,7 +102,7 @@ def matches(
     """Where correspondence measured the cells of some edges, and how surely.
 
     Args:
-        used: [E] bool, edges that may be taken. first: keyframe from which rows count.
+        used: [E] bool on the host, edges that may be taken. first: keyframe from which rows count.
     Returns:
         Samples of n edges, and weights [n,P], 0 outside the grid; None where no edge is used.
     """
@@ -106,7 +110,7 @@ def matches(
     if not len(edges):
         return None
     # Every n-th: a few edges tell the quantiles well enough.
-    edges = edges[:: -(-len(edges) // _EDGES)]
+    edges = upload(edges[:: -(-len(edges) // _EDGES)].contiguous(), view.disps.device)
     xy = view.target[edges].flatten(1, 2).transpose(1, 2).contiguous()
     weight = view.confidence[edges].mean(-1).flatten(1)
     width = view.disps.shape[2]
@@ -123,5 +127,5 @@ def weighted_quantiles(values: Tensor, weights: Tensor, shares: tuple[float, ...
     """
     ordered, order = values.flatten().sort()
     reached = weights.flatten()[order].double().cumsum(0)
-    wanted = reached[-1] * torch.tensor(shares, dtype=reached.dtype, device=reached.device)
+    wanted = reached[-1] * on_device(shares, reached.device, reached.dtype)
     return ordered[torch.searchsorted(reached, wanted).clamp_max_(len(ordered) - 1)]

@@ -90,28 +90,30 @@ class Mlp:
         """One step of Adam on the edges of the view, then new maps of `view.frames`.
 
         Returns:
-            The report of `Consistency.gradient`, and as a fact `weights_norm`.
+            The report of `Numbers.read`, and as a fact `weights_norm`, before the step.
         """
         layers, offset = self._layers(view), self._options.softplus_offset
         if view.frames.numel() == 0:
             return UncertaintyReport()
-        gradient, report = self._objective.gradient(view)
-        first, last = int(view.frames.min()), int(view.frames.max()) + 1
+        gradient, numbers = self._objective.gradient(view)
+        known = view.indices().frames
+        first, last = min(known), max(known) + 1
         rows = self._objective.rows(view, first, last)
-        if view.frames.numel() != last - first:
+        if len(known) != last - first:
             rows = rows[view.frames - first]
         rows = rows.flatten(0, 1)
         y, hidden = forward(rows, layers)
         weight = gradient.flatten() * objective.softplus_slope(y, offset)
         step = backward(weight, rows, hidden, layers) * self._objective.share(gradient)
+        before = self._state["weights"].norm()
+        report, told = numbers.read(finite=torch.isfinite(step).all(), norm=before)
         # A step that is not finite would poison the whole run; the report's energy shows it.
-        if bool(torch.isfinite(step).all()):
+        if told["finite"]:
             self._adam(step)
             y, _ = forward(rows, self._layers(view))
             u = objective.softplus(y, offset)
             self._objective.maps.write(view, u.view(-1, *view.uncertainty.shape[1:]))
-        facts = {**report.facts, "weights_norm": float(self._state["weights"].norm())}
-        return UncertaintyReport(report.energy, facts)
+        return UncertaintyReport(report.energy, {**report.facts, "weights_norm": told["norm"]})
 
     def _adam(self, gradient: Tensor) -> None:
         """Adam (Kingma and Ba 2015) with decoupled weight decay."""

@@ -20,6 +20,7 @@ from torch.nn import functional as F
 
 from droidw.geometry import se3
 from droidw.geometry.projective import NEAR, pixel_grid, relative_pose
+from droidw.geometry.transfer import on_device
 
 __all__ = [
     "EPSILON",
@@ -140,7 +141,7 @@ def make_samples(xy: Tensor, valid: Tensor, width: int, ii: Tensor, jj: Tensor) 
     """
     height = xy.shape[2] // width
     least = xy.new_zeros(2, 1)
-    most = xy.new_tensor([[width - 1.0], [height - 1.0]])
+    most = on_device([[width - 1.0], [height - 1.0]], xy.device, xy.dtype)
     place = xy.clamp(least, most)
     within = place == xy  # what the clamp changes is outside; NaN equals nothing
     inside = within[:, 0] & within[:, 1] & valid
@@ -191,10 +192,19 @@ def similarity(features: Tensor, samples: Samples, lengths: Tensor | None = None
     table = features.reshape(-1, channels)
     if lengths is None:
         lengths = features.norm(dim=2)
-    first, steps = samples.first.to(torch.int32), samples.first.new_tensor(samples.steps).int()
+    first = samples.first.to(torch.int32)
+    steps = on_device(samples.steps, features.device, torch.int32)
+    if features.is_cuda:
+        # One launch for all edges, and the host need not know their sources.
+        index, weight = first[:, None] + steps, samples.weights.T.contiguous()
+        met = F.embedding_bag(index, table, mode="sum", per_sample_weights=weight)
+        met = met.view(n_edges, cells, channels)
+        product = (met * features.index_select(0, samples.source)).sum(2)
+        length = lengths.index_select(0, samples.source) * torch.linalg.vector_norm(met, dim=2)
+        return product.div_(length.add_(EPSILON))
     ones = features.new_ones(channels)
     dot, square = features.new_empty(2, n_edges * cells).unbind()
-    group = n_edges if features.is_cuda else max(_CHUNK // (cells * channels), 1)
+    group = max(_CHUNK // (cells * channels), 1)
     sources = samples.source.tolist()
     weights = features.new_empty(min(group, n_edges) * cells, 4)
     product = features.new_empty(min(group, n_edges) * cells, channels)

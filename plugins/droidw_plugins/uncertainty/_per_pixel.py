@@ -53,17 +53,17 @@ class PerPixel:
         """One step of gradient descent on the maps of `view.frames`.
 
         Returns:
-            The report of `Consistency.gradient`.
+            The report of `Numbers.read`.
         """
         options = self._options
         if view.frames.numel() == 0:
             return UncertaintyReport()
-        gradient, report = self._objective.gradient(view)
+        gradient, numbers = self._objective.gradient(view)
         before = self._objective.maps.learned(view)[view.frames]
         moved = (before - options.lr * gradient).clamp_(options.u_min, options.u_max)
         # Cells whose step is not finite keep their value.
         self._objective.maps.write(view, torch.where(torch.isfinite(moved), moved, before))
-        return report
+        return numbers.read()[0]
 
     def state_dict(self) -> dict[str, Any]:
         """What `MatchScale.state_dict` gives; all else is in the store."""

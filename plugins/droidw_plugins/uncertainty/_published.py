@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from droidw.geometry.transfer import on_device
 from droidw.interfaces.uncertainty import StoreField, UncertaintyView
 from droidw_plugins.uncertainty import _objective as objective
 from droidw_plugins.uncertainty._options import ObjectiveOptions
@@ -90,7 +91,8 @@ class Publisher:
         options = self._options
         if options.residual_gain == 0 or view.ii.numel() == 0:
             return
-        first, last = int(view.ii.min()), int(view.ii.max()) + 1
+        known = view.indices().ii
+        first, last = min(known), max(known) + 1
         xy, valid = objective.project(view.T_cw, view.disps, view.intrinsics, view.ii, view.jj)
         shape = view.target.shape[:3]
         apart = view.target.movedim(-1, 1) - xy.view(shape[0], 2, *shape[1:])
@@ -103,7 +105,7 @@ class Publisher:
             options.residual_gain,
             options.smooth,
         )
-        starts = torch.bincount(view.ii - first).nonzero()[:, 0] + first
+        starts = on_device(sorted(set(known)), view.disps.device)
         view.fields[_FACTOR][starts] = factor[starts - first]
 
     def write(self, view: UncertaintyView, u: Tensor) -> None:
