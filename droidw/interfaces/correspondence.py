@@ -122,8 +122,10 @@ class Correspondence(Protocol):
     def motion(self, reference: Any, current: Any) -> Motion:
         """How far the picture moved from `reference` to `current` (payloads).
 
-        Called in the order of the frames, so that a part may go by the motion so far; where
-        the component has the capability "threads", from another thread than sessions are.
+        Called in the order of the frames, so that a part may go by the motion so far. Where the
+        component has the capability "threads", or "gpu-threads" and the run is on a GPU, `encode`,
+        `motion` and `context` are called ahead of time from one other thread than sessions are,
+        on a GPU with a stream of its own as the current one.
         """
         ...
 

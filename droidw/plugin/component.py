@@ -77,7 +77,8 @@ class Component(Generic[T]):
             that returns such a tuple (`weights_for` asks).
         capabilities: facts that the host checks before a run: "cpu", "cuda" (devices whose tensors
             it takes and gives), "host" (it computes on the processor on either, so that
-            `device: auto` has no reason for a GPU), "threads" (see `Correspondence.motion`),
+            `device: auto` has no reason for a GPU), "threads" and "gpu-threads" (see
+            `Correspondence.motion`),
             "features" (an uncertainty model that needs features, an extractor that gives them),
             "depth" (a depth prior that gives depth).
         reference: paper, equation or table row, and the licence of code and weights.

@@ -153,7 +153,8 @@ class _Run:
         self.masks = open_masks(self.config.input, source)
         self.context = replace(self.context, camera=camera)
         parts = self._build()
-        threads = "threads" in self.resolved.parts["correspondence"][0].capabilities
+        able = self.resolved.parts["correspondence"][0].capabilities
+        threads = "threads" in able or (self.device.type == "cuda" and "gpu-threads" in able)
         system = SlamSystem(
             self.config,
             parts,
@@ -197,6 +198,8 @@ class _Run:
             with clock("decode"):
                 raw = next(pending, None)
                 frame = None if raw is None else rectify(raw, self._mask(raw))
+                if frame is not None and self.device.type == "cuda":
+                    frame = replace(frame, image=frame.image.pin_memory())
             if frame is None:
                 return
             yield frame

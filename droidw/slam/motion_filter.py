@@ -24,11 +24,20 @@ __all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead"]
 
 @dataclass(frozen=True)
 class Encoded:
-    """A frame, what correspondence made of it, and its features where they are known already."""
+    """A frame and what correspondence made of it; of one that becomes a keyframe, more.
+
+    Attributes:
+        payload: of correspondence, of any frame. context: the same of a keyframe.
+        features: [c,h,w]. prior: [h,w] inverse depth. Both only where they were made ahead.
+        ready: when all of this is done on a GPU, see `Ahead`; None where it is done.
+    """
 
     frame: Frame
     payload: Any
+    context: Any = None
     features: Tensor | None = None
+    prior: Tensor | None = None
+    ready: Any = None
 
 
 @dataclass(frozen=True)

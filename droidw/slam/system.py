@@ -15,6 +15,7 @@ from droidw.errors import InputError
 from droidw.events import Dispatcher, FrameTracked, KeyframeAdded, KeyframeRemoved, Progress
 from droidw.geometry.camera import Grid
 from droidw.geometry.se3 import inv
+from droidw.geometry.transfer import upload
 from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.slam.backend import Backend
 from droidw.slam.cloud import consistent_depth, static_cloud
@@ -25,6 +26,7 @@ from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
 from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict, look_ahead
 from droidw.slam.optimise import Optimiser, Parts
+from droidw.slam.streams import Ahead
 from droidw.slam.timing import Stopwatch
 
 if TYPE_CHECKING:
@@ -109,6 +111,7 @@ class SlamSystem:
         # Keyframes forced by a count depend on which the window has kept: nothing runs ahead then.
         ahead = threaded and config.motion_filter.force_every == 0
         self._pool = ThreadPoolExecutor(1, "ahead") if ahead else None
+        self._ahead = Ahead(device, ahead)
         self._filter = MotionFilter(op, config.motion_filter)
         self._times: list[float] = []
         self._indices: list[int] = []
@@ -140,16 +143,23 @@ class SlamSystem:
         return self._push(*self._judge(frame))
 
     def _judge(self, frame: Frame) -> tuple[Encoded, Verdict]:
-        current = self._encode(frame)
-        with self.clock("motion filter"):
-            verdict = self._filter.judge(current)
-        if verdict.keep and self._pool is not None:
-            current = replace(current, features=self._features(frame))
-        return current, verdict
+        """Encode a frame and say whether it becomes a keyframe; if it does, make all it needs."""
+        with self._ahead.working():
+            current = self._encode(frame)
+            with self.clock("motion filter"):
+                verdict = self._filter.judge(current)
+            if verdict.keep:
+                context = self.parts.correspondence.context(current.payload, frame, self.grid)
+                current = replace(current, context=context)
+            if verdict.keep and self._pool is not None:
+                features, prior = self._features(frame), self._prior(frame)
+                current = replace(current, features=features, prior=prior)
+            return replace(current, ready=self._ahead.ready()), verdict
 
     def _features(self, frame: Frame) -> Tensor:
         with self.clock("features"):
-            return self.parts.features.extract(frame.image.to(self.store.device), self._picked)
+            image = upload(frame.image, self.store.device)
+            return self.parts.features.extract(image, self._picked)
 
     def _encode(self, frame: Frame) -> Encoded:
         with self.clock("encode"):
@@ -157,6 +167,8 @@ class SlamSystem:
 
     def _push(self, current: Encoded, verdict: Verdict) -> bool:
         frame = current.frame
+        made = current.payload, current.context, current.features, current.prior
+        self._ahead.take(current.ready, made)
         self._times.append(frame.time)
         self._indices.append(frame.index)
         if verdict.motion is not None:
@@ -192,16 +204,16 @@ class SlamSystem:
         frame, parts, store = current.frame, self.parts, self.store
         pose, disp = self.frontend.guess(frame.time)
         features = self._features(frame) if current.features is None else current.features
-        with self.clock("depth prior"):
-            prior = self._prior(frame)
-        payload = parts.correspondence.context(current.payload, frame, self.grid)
+        prior = self._prior(frame) if current.prior is None else current.prior
         pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
         if frame.mask is not None:
-            masked = {"unmasked": 1 - self.grid.covered(frame.mask.to(store.device))}
+            masked = {"unmasked": 1 - self.grid.covered(upload(frame.mask, store.device))}
         else:
             masked = {}
         number = store.append(
-            KeyframeInfo(frame.index, frame.time, frame.name, pixels.cpu().numpy(), payload),
+            KeyframeInfo(
+                frame.index, frame.time, frame.name, pixels.cpu().numpy(), current.context
+            ),
             T_cw=pose,
             disps=disp,
             features=features,
@@ -213,13 +225,15 @@ class SlamSystem:
         return number
 
     def _prior(self, frame: Frame) -> Tensor:
-        blank = self.store.disps.new_zeros(self.grid.height, self.grid.width)
-        prediction = self.parts.depth.predict(frame)
-        if prediction is None:
-            return blank
-        depth = self._picked.sample(prediction.depth.to(self.store.device), mode="nearest")
-        known = torch.isfinite(depth) & (depth > 0)
-        return torch.where(known, 1.0 / depth.clamp_min(1e-6), blank)
+        device = self.store.device
+        with self.clock("depth prior"):
+            blank = torch.zeros(self.grid.height, self.grid.width, device=device)
+            prediction = self.parts.depth.predict(frame)
+            if prediction is None:
+                return blank
+            depth = self._picked.sample(upload(prediction.depth, device), mode="nearest")
+            known = torch.isfinite(depth) & (depth > 0)
+            return torch.where(known, 1.0 / depth.clamp_min(1e-6), blank)
 
     # -- finishing -------------------------------------------------------------------------
 

@@ -40,14 +40,17 @@ def weights(tmp_path_factory):
 
 @pytest.fixture
 def go(clip, weights, tmp_path, monkeypatch, capsys):
-    """Run on a device: `go(device, *arguments)` -> (exit code, stderr, centres [N,3])."""
+    """Run on a device: `go(device, *arguments)` -> (exit code, stderr, centres [N,3]).
+
+    What is in `after` overrules `QUICK`.
+    """
     monkeypatch.setenv("DROIDW_WEIGHTS", str(weights))
 
-    def call(device, *arguments, source=None):
+    def call(device, *arguments, source=None, after=()):
         out = tmp_path / device.replace(":", "")
         code = main(
             ["run", source or str(clip), "-o", str(out), "--overwrite", "--device", device,
-             *arguments, *QUICK]
+             *arguments, *QUICK, *after]
         )  # fmt: skip
         wrong = capsys.readouterr().err
         assert "Traceback" not in wrong, wrong

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from droidw.errors import ConfigError, InputError
 from droidw.geometry.projective import pixel_grid
+from droidw.geometry.transfer import upload
 from droidw.interfaces.correspondence import Motion, Purpose
 from droidw_plugins.correspondence._droid_corr import Pyramid, lookup_lowmem, smallest_side
 from droidw_plugins.correspondence._droid_session import DroidSession
@@ -161,7 +162,7 @@ class DroidCorrespondence:
         raise ValueError(f"motion: frame {frame.index} has no context: it was never a candidate")
 
     def _image(self, frame: Frame) -> Tensor:
-        return frame.image.to(self.device, non_blocking=True)[None]
+        return upload(frame.image, self.device)[None]
 
 
 def _last(x: Tensor) -> Tensor:

@@ -55,7 +55,7 @@ class FlowCorrespondence:
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
         """Grey image and texture at the cells."""
-        rgb = cv2.merge(list(frame.image.numpy()))
+        rgb = cv2.merge(list(frame.image.cpu().numpy()))
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         centres = grid.centres().numpy().astype(np.float32)
         window = (2 * self.stride - 1, 2 * self.stride - 1)

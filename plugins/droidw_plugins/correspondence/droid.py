@@ -51,7 +51,7 @@ COMPONENT: Component[Correspondence] = Component(
     factory=_build,
     options=DroidOptions,
     weights=(DROID,),
-    capabilities=frozenset({"cpu", "cuda"}),
+    capabilities=frozenset({"cpu", "cuda", "gpu-threads"}),
     reference="Teed and Deng, DROID-SLAM: Deep Visual SLAM for Monocular, Stereo, and RGB-D "
     "Cameras, NeurIPS 2021; weights: see droidw weights list",
 )

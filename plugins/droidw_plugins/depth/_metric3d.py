@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from droidw.errors import ConfigError, InputError
+from droidw.geometry.transfer import upload
 from droidw.interfaces.depth import DepthMap
 from droidw.io.weights import fingerprint
 from droidw.plugin.component import BuildContext
@@ -134,7 +135,7 @@ class Metric3dDepth:
         """What the network is shown, [1,3,h,w]: resized, normalised, then padded with zeros."""
         fit = fit_into(image.shape[-2], image.shape[-1], self._size)
         x = F.interpolate(
-            image.to(self._device)[None],
+            upload(image, self._device)[None],
             size=(fit.height, fit.width),
             mode="bilinear",
             align_corners=False,

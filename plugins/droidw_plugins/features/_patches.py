@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from droidw.errors import InputError
+from droidw.geometry.transfer import upload
 from droidw.io.weights import fingerprint
 from droidw.plugin.component import BuildContext
 from droidw.plugin.weights import WeightsFile
@@ -89,7 +90,7 @@ class PatchFeatures:
     def network_input(self, image: Tensor) -> Tensor:
         """What the network is shown, [1,3,14*gh,14*gw]: normalised first, then resized."""
         height, width = patch_grid(image.shape[-2], image.shape[-1], self._options.long_side)
-        x = ((image.to(self._device) - self._mean) / self._std)[None]
+        x = ((upload(image, self._device) - self._mean) / self._std)[None]
         size = (height * PATCH, width * PATCH)
         if tuple(image.shape[-2:]) == size:
             return x

@@ -1,0 +1,88 @@
+"""Work on frames to come has a stream of its own, and nothing is read or given up too early."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.slam.streams import Ahead, tensors_in
+from droidw.testing.pretend_gpu import PretendGpu
+
+MOVING = ("motion_filter.threshold=0.3", "motion_filter.force_every=0", "ba=torch")
+FLOW = ("--preset", "cpu", "features={name: fit3d, options: {precision: float32}}",
+        "depth={name: metric3d, options: {variant: vit-small, size: [56, 84], precision: float32}}",
+        )  # fmt: skip
+DROID = ("--preset", "droid-slam", "correspondence.options={precision: float32, store: float}",
+         "uncertainty=affine-softplus", "features=fit3d", "frontend.predict=velocity")  # fmt: skip
+RUNS = {"flow": FLOW, "droid": DROID}
+
+
+@dataclass(frozen=True)
+class Payload:
+    index: int
+    fmap: torch.Tensor
+
+
+def test_tensors_are_found_wherever_they_are():
+    a, b, c, d = (torch.full((1,), float(k)) for k in range(4))
+    held = [Payload(0, a), {"x": (b, None)}, "text", 3, ({"y": [c]},), d]
+    assert [float(t) for t in tensors_in(held)] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(("device", "threaded"), [("cpu", True), ("cpu", False), ("cuda", False)])
+def test_without_a_thread_on_a_gpu_nothing_is_done(device, threaded):
+    ahead = Ahead(torch.device(device), threaded)
+    with ahead.working():
+        made = torch.ones(2)
+    assert ahead.stream is None and ahead.ready() is None
+    ahead.take(ahead.ready(), made)
+
+
+@pytest.fixture
+def ahead_run(go):
+    """A run with a thread that looks ahead; `QUICK` forces keyframes, which rules that out."""
+
+    def call(name):
+        with PretendGpu() as gpu:
+            code, wrong, centres = go("cuda", *RUNS[name], after=MOVING)
+        return code, wrong, centres, gpu
+
+    return call
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_the_stream_is_used_and_in_order(go, ahead_run, name):
+    code, wrong, cpu = go("cpu", *RUNS[name], after=MOVING)
+    assert code == 0, wrong
+    code, wrong, there, gpu = ahead_run(name)
+    assert code == 0, wrong
+    used = gpu.streams.used_by
+    assert len(used) == 2 and min(used.values()) > 100, used
+    assert gpu.streams.faults == []
+    np.testing.assert_allclose(there, cpu, atol=2e-3 * np.ptp(cpu, axis=0).max())
+
+
+@pytest.mark.parametrize(("broken", "said"), [
+    ("wait", "may not have finished"), ("record", "record_stream is missing"),
+])  # fmt: skip
+def test_what_is_left_out_is_found(ahead_run, monkeypatch, broken, said):
+    """That the check above can fail."""
+
+    def without_wait(self, ready, *made):
+        return None
+
+    def without_record(self, ready, *made):
+        torch.cuda.current_stream().wait_event(ready)
+
+    monkeypatch.setattr(Ahead, "take", without_wait if broken == "wait" else without_record)
+    *_, gpu = ahead_run("droid")
+    assert any(said in fault for fault in gpu.streams.faults), gpu.streams.faults
+
+
+def test_pictures_come_from_pinned_memory(ahead_run):
+    *_, gpu = ahead_run("droid")
+    late = [at for what, at in gpu.waits if "not pinned" in what]
+    assert not late
