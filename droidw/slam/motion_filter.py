@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -58,34 +59,40 @@ class Verdict:
 class MotionFilter:
     """Compares each frame with the last candidate (REFERENCE 5.1).
 
-    What it says depends on the frames alone, so that it may run ahead of the window in a thread.
+    What it says depends on the frames alone, so that it may run ahead of the window in a thread;
+    but for keyframes forced by a count, which is from the last one that the window has kept. There
+    it waits for `settled`, if what the window will say makes a difference.
 
     Args:
         correspondence: measures motion.
         options: thresholds.
+        ahead: the window works in another thread, and can be waited for.
     """
 
     def __init__(
         self,
         correspondence: Correspondence,
         options: MotionFilterConfig,
+        ahead: bool = False,
     ) -> None:
         self._correspondence = correspondence
         self._options = options
         self._reference: Encoded | None = None
-        self._last_index: int | None = None
+        # Frames are counted from here; and the candidate of which the window has yet to decide.
+        self._last_index = 0
+        self._open: int | None = None
+        self._closed = not ahead
+        self._window = threading.Condition()
         self._lost = 0
 
     def judge(self, current: Encoded) -> Verdict:
         """Whether `current` becomes a keyframe; if so it is the reference from now on."""
         if self._reference is None:
-            self._accept(current)
+            self._accept(current, forced=True)
             return Verdict(keep=True, forced=False, motion=None)
         motion = self._correspondence.motion(self._reference.payload, current.payload)
         options = self._options
-        last = self._reference.frame.index if self._last_index is None else self._last_index
-        gap = current.frame.index - last
-        forced = options.force_every > 0 and gap >= options.force_every
+        forced = options.force_every > 0 and self._gap(current.frame.index) >= options.force_every
         keep = motion.flow > options.threshold
         if motion.matched < options.min_matched and motion.matched >= options.lost_below:
             keep = True
@@ -96,24 +103,57 @@ class MotionFilter:
         if motion.matched >= options.lost_below:
             self._lost = 0
         if keep or forced:
-            self._accept(current)
+            self._accept(current, forced)
         return Verdict(keep=keep or forced, forced=forced, motion=motion)
 
-    def kept(self, index: int) -> None:
-        """Frame `index` has become a keyframe for good: frames are counted from it."""
-        self._last_index = index
+    def settled(self, index: int, kept: bool) -> None:
+        """Whether candidate `index` has become a keyframe for good: frames are counted from it."""
+        with self._window:
+            if kept:
+                self._last_index = max(self._last_index, index)
+            if self._open == index:
+                self._open = None
+            self._window.notify_all()
 
-    def _accept(self, current: Encoded) -> None:
+    def close(self) -> None:
+        """Nothing will be settled any more: whoever waits for it goes on."""
+        with self._window:
+            self._closed = True
+            self._window.notify_all()
+
+    def _gap(self, index: int) -> int:
+        """Frames since the last keyframe that the window has kept, where that matters."""
+        with self._window:
+            while (
+                self._open is not None
+                and not self._closed
+                and index - self._last_index >= self._options.force_every
+            ):
+                self._window.wait()
+            return index - self._last_index
+
+    def _accept(self, current: Encoded, forced: bool) -> None:
         self._reference = current
         self._lost = 0
+        with self._window:
+            if forced:  # the window may not drop it
+                self._last_index, self._open = current.frame.index, None
+            else:
+                self._open = current.frame.index
 
 
-def look_ahead(items: Iterable[T], depth: int, pool: ThreadPoolExecutor | None) -> Iterator[T]:
+def look_ahead(
+    items: Iterable[T],
+    depth: int,
+    pool: ThreadPoolExecutor | None,
+    stop: Callable[[], None] = lambda: None,
+) -> Iterator[T]:
     """Yield items in order, while a thread makes up to `depth` of those to come.
 
     Args:
         items: made one after the other, in whichever thread.
         pool: of one thread, or None to make each item when it is asked for.
+        stop: called when no more items are wanted, so that the thread waits for nothing.
     """
     if pool is None:
         yield from items
@@ -129,6 +169,7 @@ def look_ahead(items: Iterable[T], depth: int, pool: ThreadPoolExecutor | None) 
                 return
             yield item
     finally:
+        stop()
         # The source may not be closed while the thread is inside it.
         for future in waiting:
             if not future.cancel():

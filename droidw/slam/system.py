@@ -108,11 +108,9 @@ class SlamSystem:
             self.store, parts, config.weighting, self.clock, "droid-w" in config.compat
         )
         self.frontend = Frontend(self.optimiser, config)
-        # Keyframes forced by a count depend on which the window has kept: nothing runs ahead then.
-        ahead = threaded and config.motion_filter.force_every == 0
-        self._pool = ThreadPoolExecutor(1, "ahead") if ahead else None
-        self._ahead = Ahead(device, ahead)
-        self._filter = MotionFilter(op, config.motion_filter)
+        self._pool = ThreadPoolExecutor(1, "ahead") if threaded else None
+        self._ahead = Ahead(device, threaded)
+        self._filter = MotionFilter(op, config.motion_filter, threaded)
         self._times: list[float] = []
         self._indices: list[int] = []
         self._moved: list[float] = []
@@ -135,7 +133,7 @@ class SlamSystem:
     def track(self, frames: Iterable[Frame]) -> None:
         """Push all frames; the motion filter runs ahead of the window where it can."""
         judged = (self._judge(frame) for frame in frames)
-        for current, verdict in look_ahead(judged, _LOOK_AHEAD, self._pool):
+        for current, verdict in look_ahead(judged, _LOOK_AHEAD, self._pool, self._filter.close):
             self._push(current, verdict)
 
     def push(self, frame: Frame) -> bool:
@@ -196,8 +194,7 @@ class SlamSystem:
             dropped = self.frontend.grow(forced)
         if dropped is not None:
             self.events.emit(KeyframeRemoved(dropped, infos[dropped].index))
-        if dropped != number:
-            self._filter.kept(current.frame.index)
+        self._filter.settled(current.frame.index, dropped != number)
         return dropped != number
 
     def _append(self, current: Encoded) -> int:

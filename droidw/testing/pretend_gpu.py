@@ -61,6 +61,7 @@ class PretendGpu:
     def __init__(self) -> None:
         self.waits: Counter[tuple[str, str]] = Counter()
         self.streams = Streams(self._waited)
+        self._by_thread: Counter[int] = Counter()
         self._autocast = Autocast()
         self._lock = threading.RLock()
         self._stack = ExitStack()
@@ -93,8 +94,8 @@ class PretendGpu:
         return "\n".join(f"{n:6d} {what}: {at}" for (what, at), n in self.waits.most_common())
 
     def total(self) -> int:
-        """How often the host has waited so far."""
-        return sum(self.waits.values())
+        """How often this thread has waited so far."""
+        return self._by_thread[threading.get_ident()]
 
     # -- operations ------------------------------------------------------------------------
 
@@ -190,6 +191,7 @@ class PretendGpu:
     def _waited(self, what: str) -> None:
         with self._lock:
             self.waits[what, _caller()] += 1
+            self._by_thread[threading.get_ident()] += 1
         self.streams.host_waits()
 
 

@@ -239,7 +239,7 @@ def test_frames_are_counted_from_the_last_keyframe_that_stayed():
     verdicts = []
     for k in range(12):
         verdicts.append(judge.judge(Encoded(Frame(k, k / 30, blank, blank), k)))
-        if k == 0:
-            judge.kept(0)
-    assert [v.keep for v in verdicts] == [True] + [False] * 4 + [True] + [False] * 3 + [True] * 3
-    assert [v.forced for v in verdicts] == [False] * 9 + [True] * 3
+        if verdicts[-1].keep:
+            judge.settled(k, kept=k != 5)
+    assert [k for k, v in enumerate(verdicts) if v.keep] == [0, 5, 9]
+    assert [k for k, v in enumerate(verdicts) if v.forced] == [9]

@@ -1,0 +1,75 @@
+"""The motion filter ahead of the window: what it waits for, and what it does not."""
+
+from __future__ import annotations
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from droidw.config.schema import MotionFilterConfig
+from droidw.interfaces.correspondence import Motion
+from droidw.slam.frame import Frame
+from droidw.slam.motion_filter import Encoded, MotionFilter, look_ahead
+
+COUNT = 60
+MOVED = {k for k in range(COUNT) if k % 7 in (3, 4)}
+
+
+class Table:
+    """Correspondence that moves at some frames."""
+
+    def motion(self, reference, current):
+        return Motion(9.0 if current in MOVED else 0.0, 1.0)
+
+
+def judged(judge):
+    blank = torch.zeros(0)
+    for k in range(COUNT):
+        encoded = Encoded(Frame(k, k / 30, blank, blank), k)
+        yield k, judge.judge(encoded)
+
+
+def verdicts(ahead, drops):
+    """(frame, forced) of all candidates; the window drops those in `drops` that it may."""
+    judge = MotionFilter(Table(), MotionFilterConfig(force_every=5), ahead)
+    found = []
+    with ThreadPoolExecutor(1) as pool:
+        for k, verdict in look_ahead(judged(judge), 32, pool if ahead else None, judge.close):
+            if verdict.keep:
+                found.append((k, verdict.forced))
+                judge.settled(k, verdict.forced or k not in drops)
+    return found
+
+
+@pytest.mark.parametrize("drops", [set(), MOVED, {3, 10, 17, 31}])
+def test_what_runs_ahead_says_the_same(drops):
+    expected = verdicts(False, drops)
+    assert any(forced for _, forced in expected) and not all(forced for _, forced in expected)
+    for _ in range(5):
+        assert verdicts(True, drops) == expected
+
+
+def test_it_goes_on_until_the_window_matters():
+    """A candidate of frame 3 that may be dropped matters from frame 5 on, and not before."""
+    judge = MotionFilter(Table(), MotionFilterConfig(force_every=5), ahead=True)
+
+    items = judged(judge)
+    assert [next(items)[0] for _ in range(5)] == [0, 1, 2, 3, 4]
+    done = threading.Event()
+    thread = threading.Thread(target=lambda: (next(items), done.set()))
+    thread.start()
+    assert not done.wait(0.2), "frame 5 was judged without knowing of frame 4"
+    judge.settled(3, kept=False)
+    judge.settled(4, kept=True)
+    thread.join()
+    assert done.is_set()
+
+
+def test_stopping_early_leaves_nobody_waiting():
+    judge = MotionFilter(Table(), MotionFilterConfig(force_every=5), ahead=True)
+    with ThreadPoolExecutor(1) as pool:
+        ahead = look_ahead(judged(judge), 32, pool, judge.close)
+        assert [next(ahead)[0] for _ in range(4)] == [0, 1, 2, 3]
+        ahead.close()  # hangs if the thread waits for what the window says of frame 3
