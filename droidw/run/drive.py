@@ -388,5 +388,7 @@ def _seed(seed: int, threads: int) -> None:
     # Half of the cores for torch: the other half decodes and searches flow at the same time, and
     # torch's threads wait for each other, which costs far more than they gain on a busy core.
     torch.set_num_threads(max(1, (threads or os.cpu_count() or 1) // 2))
+    # What is float32 is float32 on a GPU too: cuDNN rounds it to ten bits of mantissa by default.
+    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
     # OpenCV's own threads make optical flow depend on their number; droidw runs its own.
     cv2.setNumThreads(1)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 import droidw
+from droidw.slam.system import SlamSystem
 from droidw.testing.pretend_gpu import PretendGpu
+from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 
 FLOW = ("--preset", "cpu", "ba=torch", "frontend.predict=velocity")
 DROID = (
@@ -76,13 +79,40 @@ def test_correspondence_from_the_truth(either):
     np.testing.assert_allclose(there, cpu, atol=1e-4 * np.ptp(cpu, axis=0).max())
 
 
+def network_of(part):
+    """The network inside a built part, and in which precision it multiplies."""
+    return getattr(part, "net", None) or part._network, getattr(part, "mixed", None)
+
+
 @pytest.mark.parametrize("preset", ["paper", "droid-slam"])
-def test_half_precision_of_the_networks(go, gpu, preset):
-    """As on a GPU by default: networks in float16, and geometry that never leaves float32."""
+def test_half_precision_of_the_networks(go, gpu, preset, monkeypatch):
+    """By default networks multiply in float16, and bundle adjustment gets float32."""
+    seen = {"problem": set(), "parts": None}
+    step, made = TorchBundleAdjuster.step, SlamSystem.__init__
+
+    def stepped(self, problem):
+        floats = (problem.T_cw, problem.disps, problem.intrinsics, problem.target, problem.weight)
+        seen["problem"] |= {(tensor.dtype, tensor.device.type) for tensor in floats}
+        return step(self, problem)
+
+    def built(self, config, parts, *args, **kwargs):
+        seen["parts"] = parts
+        made(self, config, parts, *args, **kwargs)
+
+    monkeypatch.setattr(TorchBundleAdjuster, "step", stepped)
+    monkeypatch.setattr(SlamSystem, "__init__", built)
     small = [SMALL.replace(", precision: float32", "")] if preset == "paper" else []
     code, wrong, centres = go("cuda", "--preset", preset, "ba=torch", *small)
     assert code == 0, wrong
     assert np.isfinite(centres).all() and gpu.streams.faults == []
+    assert seen["problem"] == {(torch.float32, "cuda")}
+    parts = seen["parts"]
+    network, mixed = network_of(parts.correspondence)
+    assert mixed == torch.float16 and network.fnet.conv1.weight.is_cuda
+    for part in (parts.features, parts.depth) if preset == "paper" else ():
+        network, _ = network_of(part)
+        linear = next(m for m in network.modules() if isinstance(m, torch.nn.Linear))
+        assert linear.weight.dtype == torch.float16 and linear.weight.is_cuda
 
 
 SLOTS = ("features", "depth", "uncertainty", "ba", "correspondence")
