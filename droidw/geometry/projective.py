@@ -37,6 +37,8 @@ FAR_DISTANCE = 1000.0
 _MIN_SHARE = 0.75
 # Cells that `frame_distance` works on at a time: its planes then stay in the processor's cache.
 _CHUNK_CELLS = 1 << 16
+# A GPU has no use for that, and each part costs it launches.
+_CHUNK_CELLS_GPU = 1 << 22
 
 
 def pixel_grid(
@@ -167,7 +169,7 @@ def frame_distance(
     pixels = _homogeneous(h, w, disps)
     flat = disps.flatten(1)
     out = torch.empty(ii.shape[0], dtype=disps.dtype, device=disps.device)
-    step = max(1, _CHUNK_CELLS // (h * w))
+    step = max(1, (_CHUNK_CELLS_GPU if disps.is_cuda else _CHUNK_CELLS) // (h * w))
     for start in range(0, ii.shape[0], step):
         part = slice(start, min(start + step, ii.shape[0]))
         d = flat.index_select(0, ii[part])

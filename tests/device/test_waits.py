@@ -74,6 +74,11 @@ def test_waits_of_the_inner_loop(watch, arguments):
     assert len(counts["window"]) > 1, "no window was run"
 
 
+def test_calibrated_similarities_cost_one_more(watch):
+    counts, gpu = watch(*DROID, "weighting.similarity=matched")
+    assert set(counts["learn"]) <= {1, 2} and 2 in counts["learn"], gpu.waits_by_line()
+
+
 def test_a_new_keyframe_waits_for_nothing_that_is_not_new(watch):
     """Calibrations and positions are made once, from the first picture."""
     counts, gpu = watch(*DROID)
