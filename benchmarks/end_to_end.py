@@ -33,7 +33,6 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 SERIAL = (
     "start",
-    "depth prior",
     "frontend",
     "global",
     "fill",
@@ -42,7 +41,7 @@ SERIAL = (
 )
 """Stages that follow each other in one thread; what they leave of the run is `between`."""
 
-BESIDE = ("decode", "encode", "motion filter", "features")
+BESIDE = ("decode", "encode", "motion filter", "features", "depth prior")
 """Stages of other threads, which take time from nobody who does not wait for them."""
 
 LIMITS: Mapping[str, float] = {
