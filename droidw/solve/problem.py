@@ -19,7 +19,8 @@ __all__ = ["BAProblem", "Report", "Step"]
 class BAProblem:
     """Weighted dense bundle adjustment over E directed edges i -> j (REFERENCE 3).
 
-    Energy: sum over edges, cells and x/y of `weight * rho(target - projection)^2`, plus
+    Energy: sum over edges and cells of `r^T W r` with the residual r = target - projection and the
+    information W = [[xx, xy], [xy, yy]] of `weight`, robust if `huber` says so, plus
     `prior_weight * (disp - prior)^2` where `prior > 0`, plus `damping * step^2` elsewhere.
 
     Attributes:
@@ -28,15 +29,17 @@ class BAProblem:
         intrinsics: [4] fx fy cx cy of the grid.
         ii, jj: [E] int64.
         target: [E,h,w,2] measured position of cell of i in j, cells.
-        weight: [E,h,w,2] >= 0: confidence x uncertainty x validity, all factors in.
+        weight: [E,h,w,2] (xx, yy) or [E,h,w,3] (xx, yy, xy), information of the match in 1/cell^2:
+            confidence x uncertainty x validity, all factors in. xx, yy >= 0; |xy| <= sqrt(xx yy)
+            up to rounding, so 0 where either is 0. Two channels mean xy = 0.
         fixed: [N] bool, poses that must not move. Poses without an edge do not move either.
         damping: [N,h,w] added to the depth diagonal where there is no prior.
         prior: [N,h,w] inverse depth of a depth prior, 0 where there is none; or None.
         prior_weight: gamma_d of REFERENCE 3.2.
         motion_only: move poses, leave depths.
         lm, ep: diag(S) <- diag(S) * (1 + lm) + ep on the reduced system.
-        huber: threshold in cells of a Huber kernel on the residual length s, or None; where the
-            weights of x and y differ, s^2 = sum(weight r^2) / mean(weight) over the two.
+        huber: threshold in cells of a Huber kernel on the residual length s, or None;
+            s^2 = r^T W r / (trace(W) / 2), the plain length where all directions weigh the same.
         min_disp, max_disp: bounds of the disparity after the step (max None: unbounded).
         guard: evaluate the energy after the step; shorten the step while it rose, and reject it
             if no shorter one lowers the energy.
@@ -63,6 +66,11 @@ class BAProblem:
     max_disp: float | None = None
     guard: bool = False
     pairs: Sequence[tuple[int, int]] | None = None
+
+    @property
+    def channels(self) -> int:
+        """Channels that `weight` must have: 3 with the off-diagonal of the information, else 2."""
+        return 3 if self.weight.shape[-1] == 3 else 2
 
     def edges(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """`ii` and `jj` on the host, [E] each."""

@@ -64,6 +64,7 @@ def bundle_adjuster(subject: Subject) -> None:
     _options_of_the_problem(subject, part, problem)
     _bad_numbers(subject, part, problem)
     _convergence(subject, part, problem)
+    _information(subject, part, problem, step)
 
 
 def _options_of_the_problem(subject: Subject, part: Any, problem: BAProblem) -> None:
@@ -110,6 +111,40 @@ def _options_of_the_problem(subject: Subject, part: Any, problem: BAProblem) -> 
         "guard",
         guarded.report.status != "ok" or guarded.report.cost_after <= guarded.report.cost_before,
         "a guarded step raised the energy",
+    )
+
+
+def _information(subject: Subject, part: Any, problem: BAProblem, plain: Step) -> None:
+    """Weights with a third channel, the off-diagonal of the information."""
+    draw = torch.Generator().manual_seed(11)
+    tilt = 2 * torch.rand(problem.weight.shape[:3], generator=draw).to(subject.device) - 1
+    xy = (tilt * problem.weight.prod(-1).sqrt())[..., None]
+    none, tilted = (
+        dataclasses.replace(problem, weight=torch.cat((problem.weight, x), dim=-1))
+        for x in (torch.zeros_like(xy), xy)
+    )
+    step = _step(subject, part, none, "an off-diagonal of zeros")
+    subject.expect(
+        "information",
+        bool(
+            torch.allclose(step.T_cw, plain.T_cw, atol=2e-4)
+            and torch.allclose(step.disps, plain.disps, atol=2e-3)
+        ),
+        "an off-diagonal of zeros changes the step",
+    )
+    step = _step(subject, part, tilted, "a full information")
+    coords, valid = projective.reproject(
+        problem.T_cw, problem.disps, problem.intrinsics, problem.ii, problem.jj
+    )
+    x, y = (problem.target - coords).double().unbind(-1)
+    xx, yy, off = (tilted.weight * valid[..., None]).double().unbind(-1)
+    energy = float((xx * x * x + 2 * off * x * y + yy * y * y).sum())
+    found = step.report.cost_before
+    subject.expect(
+        "information",
+        step.report.status == "ok" and abs(found - energy) < 1e-3 * energy,
+        f"with a full information the status is '{step.report.status}' and the energy "
+        f"{found:.6g}; {energy:.6g} is due",
     )
 
 

@@ -142,8 +142,9 @@ def check_bundle_adjuster(
     Clauses: `fresh` tensors; `fixed` poses and `isolated` ones do not move; `unit` quaternions;
     `status` is a known word, "empty" without edges, and everything but "ok" returns the input;
     `edge-order` does not matter; `motion-only` leaves disparities; `prior` draws them; `bounds`
-    hold; `guard` never raises the energy; `bad-numbers` are dropped and counted; `converges`: 15
-    steps on exact measurements bring the error below a twentieth.
+    hold; `guard` never raises the energy; `information` may have an off-diagonal (three channels
+    of weight); `bad-numbers` are dropped and counted; `converges`: 15 steps on exact measurements
+    bring the error below a twentieth.
 
     Raises:
         AssertionError: a clause does not hold.

@@ -11,7 +11,25 @@ from droidw.geometry import projective, se3
 from droidw.solve.problem import BAProblem
 
 
-def make_problem(n=5, h=6, w=8, reach=2, dtype=torch.float64, noise=0.0, seed=0, **changes):
+def with_cross(weight, seed=0):
+    """Information (xx, yy, xy) of these weights: some of rank 1, some of x or y alone."""
+    g = torch.Generator().manual_seed(seed)
+    shape = weight.shape[:-1]
+
+    def some(share):
+        return torch.rand(shape, generator=g) < share
+
+    alone = torch.stack((some(0.1), some(0.1)), dim=-1)
+    weight = torch.where(alone, torch.zeros_like(weight), weight)
+    tilt = 2 * torch.rand(shape, generator=g, dtype=torch.float64).to(weight.dtype) - 1
+    tilt = torch.where(some(0.2), tilt.sign(), tilt)
+    cross = tilt * weight.prod(-1).sqrt()
+    return torch.cat((weight, cross[..., None]), dim=-1)
+
+
+def make_problem(
+    n=5, h=6, w=8, reach=2, dtype=torch.float64, noise=0.0, seed=0, cross=False, **changes
+):
     """n cameras on a curve over a wavy surface; `noise` perturbs the start, not the flow."""
     g = torch.Generator().manual_seed(seed)
 
@@ -40,7 +58,7 @@ def make_problem(n=5, h=6, w=8, reach=2, dtype=torch.float64, noise=0.0, seed=0,
         ii=ii,
         jj=jj,
         target=target,
-        weight=weight,
+        weight=with_cross(weight, seed) if cross else weight,
         fixed=fixed,
         damping=torch.full_like(disps, 1e-6),
     )

@@ -31,7 +31,10 @@ def cast(problem, dtype, device="cpu"):
 
 
 def random_problem(make, seed):
-    """Sizes, edges, fixed and empty frames, priors, kernels and broken cells by chance."""
+    """Sizes, edges, fixed and empty frames, priors, kernels and broken cells by chance.
+
+    Every second one has cross terms.
+    """
     g = torch.Generator().manual_seed(seed)
 
     def pick(*choices):
@@ -42,7 +45,7 @@ def random_problem(make, seed):
     p, _, _ = make(
         n=n, h=h, w=w, reach=pick(1, 2, 4), noise=pick(0.005, 0.02), seed=seed,
         lm=1e-2, ep=1.0, huber=pick(None, 0.3), motion_only=pick(False, False, True),
-        guard=pick(False, True), max_disp=pick(None, 2.0),
+        guard=pick(False, True), max_disp=pick(None, 2.0), cross=seed % 2 == 1,
     )  # fmt: skip
     # some edges go, some come twice, some lead nowhere
     some = torch.rand(len(p.ii), generator=g) < pick(0.5, 1.0)
@@ -64,12 +67,14 @@ def random_problem(make, seed):
     if pick(False, True):
         target = p.target.clone()
         target[0, 1, 1] = float("nan")
-        p = replace(p, target=target)
+        weight = p.weight.clone()
+        weight[-1, 0, 2, -1] = float("inf")  # the cross term, where there is one
+        p = replace(p, target=target, weight=weight)
     return p
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(16))
 def test_one_step_on_a_random_problem(make, tested, seed, dtype):
     name, backend = tested
     exact = cast(cast(random_problem(make, seed), dtype), torch.float64)  # what float32 can hold
@@ -108,10 +113,13 @@ def converged(adjuster, problem, steps=10):
     return problem
 
 
+@pytest.mark.parametrize("cross", [False, True])
 @pytest.mark.parametrize("seed", range(2))
-def test_the_error_at_convergence(make, tested, seed):
+def test_the_error_at_convergence(make, tested, seed, cross):
     name, backend = tested
-    p, T_cw, _ = make(n=7, h=12, w=16, reach=3, noise=0.02, seed=seed, lm=1e-4, ep=1e-3)
+    p, T_cw, _ = make(
+        n=7, h=12, w=16, reach=3, noise=0.02, seed=seed, lm=1e-4, ep=1e-3, cross=cross
+    )
     g = torch.Generator().manual_seed(seed)
     target = p.target + 0.2 * torch.randn(p.target.shape, generator=g, dtype=torch.float64)
     p = replace(p, target=target, damping=torch.full_like(p.disps, 1e-3), huber=0.5)

@@ -279,6 +279,9 @@ def test_bundle_faults_are_caught():
             return step
         return Step(problem.T_cw * float("nan"), problem.disps.clone(), Report("ok", 1.0))
 
+    def two_channels(problem, step, part):
+        return part.step(dataclasses.replace(problem, weight=problem.weight[..., :2]))
+
     for clause, change in (
         ("converges", frozen),
         ("unit|fixed", moves_fixed),
@@ -286,6 +289,7 @@ def test_bundle_faults_are_caught():
         ("fresh", shares),
         ("motion-only", moves_depth),
         ("finite", poisoned),
+        ("information", two_channels),
     ):
         made = solver(change)
         with pytest.raises(AssertionError, match=f"breaks clause '({clause})'"):

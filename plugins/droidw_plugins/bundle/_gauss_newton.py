@@ -196,12 +196,15 @@ def _towards_prior(problem: BAProblem, dz: Tensor) -> None:
 
 def _without_nonfinite(problem: BAProblem) -> tuple[BAProblem, int]:
     """The problem with weight 0 on cells whose target or weight is not finite, and their number."""
-    usable = torch.isfinite(problem.weight * problem.target.square()).all(-1, keepdim=True)
-    zero = torch.zeros_like(problem.target)
+    target, weight = problem.target, problem.weight
+    usable = torch.isfinite(weight[..., :2] * target.square()).all(-1, keepdim=True)
+    if problem.channels == 3:
+        usable &= torch.isfinite(weight[..., 2:] * target.prod(-1, keepdim=True))
+    zero = target.new_zeros(())
     cleaned = replace(
         problem,
-        target=torch.where(usable, problem.target, zero),
-        weight=torch.where(usable, problem.weight, zero),
+        target=torch.where(usable, target, zero),
+        weight=torch.where(usable, weight, zero),
     )
     return cleaned, int((~usable).sum())
 

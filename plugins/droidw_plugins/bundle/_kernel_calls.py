@@ -38,7 +38,7 @@ __all__ = [
 PREBUILT_VARIABLE = "DROIDW_CUDA_KERNELS"
 """A library made beforehand, taken before any other."""
 
-_VERSION = 1
+_VERSION = 2
 _NVCC_FLAGS = ("-std=c++17", "-O3", "-shared", "-Xcompiler", "-fPIC")
 OLDEST, NEWEST = 75, 121
 """Compute capabilities, times ten, that the kernels are made for."""
@@ -50,7 +50,10 @@ class Job(ctypes.Structure):
     _fields_: ClassVar = [
         (name, kind)
         for kind, names in (
-            (c_int64, "frames edges height width sources pairs blocks chunk chunks stride"),
+            (
+                c_int64,
+                "frames edges height width sources pairs blocks chunk chunks stride channels",
+            ),
             (c_void_p, "T_cw disps intrinsics target weight damping prior fixed"),
             (c_double, "prior_weight lm ep huber min_disp max_disp floor scale"),
             (c_int64, "motion_only check"),

@@ -170,7 +170,7 @@ class _Attempt:
         job.huber = -1.0 if p.huber is None else p.huber
         job.min_disp = p.min_disp
         job.max_disp = math.inf if p.max_disp is None else p.max_disp
-        job.check = int(check)
+        job.check, job.channels = int(check), p.channels
 
     def run(self) -> _Found:
         """All kernels of a full step, and one transfer."""
@@ -251,7 +251,7 @@ def _ready(problem: BAProblem) -> BAProblem:
     edges = problem.ii.shape[0]
     shapes = {
         "T_cw": (n, 7), "disps": (n, h, w), "intrinsics": (4,), "target": (edges, h, w, 2),
-        "weight": (edges, h, w, 2), "damping": (n, h, w), "prior": (n, h, w),
+        "weight": (edges, h, w, problem.channels), "damping": (n, h, w), "prior": (n, h, w),
     }  # fmt: skip
     ready: dict[str, Any] = {}
     for name, shape in shapes.items():

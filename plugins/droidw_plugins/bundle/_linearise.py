@@ -19,6 +19,7 @@ from droidw.geometry import se3
 from droidw.geometry.projective import NEAR, pixel_grid
 from droidw.geometry.transfer import on_device
 from droidw.solve.problem import BAProblem
+from droidw_plugins.bundle._cross import Pivots, cross_products, cross_rows, pivots
 from droidw_plugins.bundle._layout import Layout, Workspace
 
 __all__ = ["SIGNS", "EdgeMotions", "EdgeSums", "edge_motions", "energy", "linearise"]
@@ -84,8 +85,9 @@ class _Chunk:
     ba: Tensor  # [n,2,P] Y / Z, X / Z
     inv_z: Tensor  # [n,P] 1 / Z, with Z clamped to NEAR
     ok: Tensor  # [n,P] 1 where Z >= NEAR
-    weight: Tensor  # [n,P,2]
+    weight: Tensor  # [n,2,P]
     r: Tensor  # [n,2,P]
+    cross: Pivots | None  # weight and r are of its two measurements, where there is one
 
 
 def linearise(
@@ -120,6 +122,15 @@ def linearise(
     t = motions.t.to(like.dtype)
     for c in _project(problem, layout, motions, problem.disps, work, chunk):
         n = c.d.shape[0]
+        if valid is not None:
+            valid[c.part] = c.ok
+        planes = None if coupling is None or depth is None else (coupling[c.part], depth[c.part])
+        if c.cross is not None:
+            root = _roots(c, problem.huber, work)
+            h = c.d.mul_(c.inv_z)
+            every = cross_rows(root, c.cross.k, c.r, h, c.ab, c.inv_z, t[c.part], focal, work)
+            cross_products(every, gram[c.part], planes)
+            continue
         rows = work.take("rows", n, 2, 7, n_cells, like=like)
         _weighted_rows(c, t[c.part], focal, problem.huber, rows, work, problem.motion_only)
         flat = rows.view(2 * n, 7, n_cells)
@@ -127,10 +138,8 @@ def linearise(
         out = gram[c.part]
         out[:, u_rows[:, None], u_rows] = products[:, 0] * u_signs * u_signs[:, None]
         out[:, v_rows[:, None], v_rows] += products[:, 1]
-        if coupling is not None and depth is not None:
-            _depth_products(rows, coupling[c.part], depth[c.part])
-        if valid is not None:
-            valid[c.part] = c.ok
+        if planes is not None:
+            _depth_products(rows, *planes)
     return EdgeSums(gram, coupling, depth, valid)
 
 
@@ -152,23 +161,24 @@ def energy(
     total = torch.zeros((), dtype=torch.float64, device=disps.device)
     motions = edge_motions(T_cw, layout)
     for c in _project(problem, layout, motions, disps, work, chunk):
-        weight = c.weight.transpose(1, 2) * valid[c.part].unsqueeze(1)
+        weight = c.weight * valid[c.part].unsqueeze(1)
         cells = (weight * c.r * c.r).sum(1)
         if problem.huber is not None:
-            knee = problem.huber / _length(cells, weight).clamp_(min=problem.huber)
+            knee = problem.huber / _length(c, cells, weight).clamp_(min=problem.huber)
             cells *= knee * (2.0 - knee)  # 1 inside the threshold, (2hs - h^2) / s^2 outside
         total += cells.sum(1).double().sum()
     return total
 
 
-def _length(cells: Tensor, weight: Tensor) -> Tensor:
+def _length(c: _Chunk, cells: Tensor, weight: Tensor) -> Tensor:
     """Residual length s [n,P] that a robust kernel sees, cells.
 
-    Where the weights of x and y [n,2,P] differ, so do their shares: s^2 = W r^2 / mean(W), with
-    W r^2 in `cells`. The reweighted step is then the exact gradient of mean(W) rho(s).
+    Where the weights [n,2,P] of directions differ, so do their shares: s^2 = r^T W r / mean(W),
+    with r^T W r in `cells` and half of the trace of W as the mean. The reweighted step is then the
+    exact gradient of mean(W) rho(s).
     """
-    mean = weight.mean(1).clamp_(min=torch.finfo(weight.dtype).tiny)
-    return (cells / mean).sqrt_()
+    mean = weight.mean(1) if c.cross is None else c.cross.mean
+    return (cells / mean.clamp_(min=torch.finfo(weight.dtype).tiny)).sqrt_()
 
 
 def _project(
@@ -195,7 +205,8 @@ def _project(
     torch.div(xy[:, 1] - cy, fy, out=rays[1])
     flat = disps.reshape(-1, n_cells)
     targets = problem.target.reshape(-1, 2 * n_cells)
-    weights = problem.weight.reshape(-1, 2 * n_cells)
+    channels = problem.channels
+    weights = problem.weight.reshape(-1, channels * n_cells)
     size = max(1, chunk // n_cells)
     for start in range(0, n_edges, size):
         part = slice(start, min(start + size, n_edges))
@@ -205,7 +216,7 @@ def _project(
         torch.index_select(flat, 0, layout.ii[part], out=d)
         target = work.take("target", n, 2 * n_cells, like=like)
         torch.index_select(targets, 0, index, out=target)
-        weight = work.take("weight", n, 2 * n_cells, like=like)
+        weight = work.take("weight", n, channels * n_cells, like=like)
         torch.index_select(weights, 0, index, out=weight)
         points = work.take("points", n, 4, n_cells, like=like)
         torch.mm(R[part].reshape(-1, 3), rays, out=points.view(-1, n_cells))
@@ -219,7 +230,24 @@ def _project(
         r = work.take("residual", n, 2, n_cells, like=like)
         torch.addcmul(target.view(n, n_cells, 2).transpose(1, 2), ab, focal, value=-1.0, out=r)
         r -= centre
-        yield _Chunk(part, d, ab, ba, inv_z, ok, weight.view(n, n_cells, 2), r)
+        cross = pivots(weight.view(n, n_cells, 3)) if channels == 3 else None
+        if cross is None:
+            weight = weight.view(n, n_cells, 2).transpose(1, 2)
+        else:
+            weight = cross.weight
+            r[:, 0].addcmul_(cross.k, r[:, 1])
+        yield _Chunk(part, d, ab, ba, inv_z, ok, weight, r, cross)
+
+
+def _roots(c: _Chunk, huber: float | None, work: Workspace) -> Tensor:
+    """Square roots [n,2,P] of the weights, robust ones where there is a kernel."""
+    root = work.take("root", *c.r.shape, like=c.d)
+    torch.mul(c.weight, c.ok[:, None], out=root)
+    if huber is not None:
+        # iteratively reweighted least squares: weight h / s beyond the threshold
+        length = _length(c, (root * c.r * c.r).sum(1), root)
+        root *= (huber / length.clamp_(min=huber)).unsqueeze(1)
+    return root.sqrt_()
 
 
 def _weighted_rows(
@@ -236,14 +264,7 @@ def _weighted_rows(
     Per part and in this order, with h the disparity in j: (h, ah, ab, 1+a^2, b, J_z, r) for u and
     (h, bh, ab, 1+b^2, a, J_z, r) for v, all but r times the focal length.
     """
-    n, n_cells = c.d.shape
-    root = work.take("root", n, 2, n_cells, like=c.d)
-    torch.mul(c.weight.transpose(1, 2), c.ok[:, None], out=root)
-    if huber is not None:
-        # iteratively reweighted least squares: weight h / s beyond the threshold
-        length = _length((root * c.r * c.r).sum(1), root)
-        root *= (huber / length.clamp_(min=huber)).unsqueeze(1)
-    root.sqrt_()
+    root = _roots(c, huber, work)
     torch.mul(root, c.r, out=rows[:, :, 6])
     root *= focal
     h = c.d.mul_(c.inv_z)

@@ -25,7 +25,7 @@ from droidw_plugins.bundle._build import (
 
 __all__ = ["NativeKernels", "load_native", "native_recipe"]
 
-_VERSION = 1
+_VERSION = 2
 _STATUS = ("ok", "rejected", "singular", "nonfinite", "empty")
 _COMPILERS = ("c++", "g++", "clang++")
 _PLAIN = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
@@ -35,7 +35,7 @@ class _Problem(ctypes.Structure):
     """`dw::Problem` of csrc/native_problem.h."""
 
     _fields_: ClassVar = [
-        *((name, c_int64) for name in ("frames", "edges", "height", "width")),
+        *((name, c_int64) for name in ("frames", "edges", "height", "width", "channels")),
         *((name, c_void_p) for name in ("ii", "jj", "T_cw", "disps", "target", "weight")),
         *((name, c_void_p) for name in ("damping", "prior", "fixed")),
         *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
@@ -159,7 +159,7 @@ class NativeKernels:
         T_out, disps_out = torch.empty_like(T_cw), torch.empty_like(disps)
         isolated = torch.empty(n, dtype=torch.int64)
         call = _Problem(
-            n, edges, h, w,
+            n, edges, h, w, problem.channels,
             ii.data_ptr(), jj.data_ptr(), T_cw.data_ptr(), disps.data_ptr(),
             target.data_ptr(), weight.data_ptr(), damping.data_ptr(),
             None if prior is None else prior.data_ptr(), fixed.data_ptr(),
@@ -190,7 +190,7 @@ def _check(problem: BAProblem, n: int, edges: int, h: int, w: int) -> None:
     """What would make the kernels read beyond the tensors."""
     shapes = {
         "T_cw": (n, 7), "damping": (n, h, w), "fixed": (n,), "ii": (edges,), "jj": (edges,),
-        "target": (edges, h, w, 2), "weight": (edges, h, w, 2), "intrinsics": (4,),
+        "target": (edges, h, w, 2), "weight": (edges, h, w, problem.channels), "intrinsics": (4,),
     }  # fmt: skip
     if problem.prior is not None:
         shapes["prior"] = (n, h, w)

@@ -17,6 +17,7 @@ constexpr int FLAGS = 6;
 // Mirrors droidw_plugins.bundle._kernel_calls.Job. Void pointers are of the problem's type.
 struct Job {
     int64_t frames, edges, height, width, sources, pairs, blocks, chunk, chunks, stride;
+    int64_t channels;  // of weight: 2, or 3 with the cross term
     const void *T_cw, *disps, *intrinsics, *target, *weight, *damping, *prior;
     const uint8_t* fixed;
     double prior_weight, lm, ep, huber, min_disp, max_disp, floor, scale;
@@ -68,24 +69,23 @@ DW_HD S ray_y(const Job& job, const Camera<S>& K, int64_t cell) {
 }
 
 // One cell of one edge, as far as all kernels need it.
-template <class S>
+template <class S, bool CROSS>
 struct Cell {
     Camera<S> K;
     Motion<S> G;
-    S x, y, d, tu, tv, wu, wv, dropped;
+    Match<S> match;
+    S x, y, d, dropped;
 
     DW_HD Cell(const Job& job, int64_t e, int64_t cell) : K(camera_of<S>(job)) {
         G = static_cast<const Motion<S>*>(job.rounded)[e];
         x = ray_x(job, K, cell);
         y = ray_y(job, K, cell);
         d = static_cast<const S*>(job.disps)[job.ii[e] * job.cells() + cell];
-        const int64_t at = 2 * (job.order[e] * job.cells() + cell);
-        const S *target = static_cast<const S*>(job.target), *weight = static_cast<const S*>(job.weight);
-        tu = target[at];
-        tv = target[at + 1];
-        wu = weight[at];
-        wv = weight[at + 1];
-        dropped = job.check ? drop_nonfinite(tu, tv, wu, wv) : S(0);
+        const int64_t at = job.order[e] * job.cells() + cell;
+        const S* const target = static_cast<const S*>(job.target) + 2 * at;
+        const S* const weight = static_cast<const S*>(job.weight) + (CROSS ? 3 : 2) * at;
+        match = {target[0], target[1], weight[0], weight[1], CROSS ? weight[2] : S(0)};
+        dropped = job.check ? drop_nonfinite<CROSS>(match) : S(0);
     }
 };
 

@@ -16,7 +16,9 @@ int launch_system(const Job& job, void* stream) {
     map(queue, job.edges, RelativeMotions<S>{
         job, static_cast<const S*>(job.T_cw), reinterpret_cast<Motion<double>*>(job.motions),
         static_cast<Motion<S>*>(job.rounded)});
-    reduce<EDGE_SUMS>(queue, job.edges * job.chunks, LineariseEdges<S>{job}, job.edge_part);
+    const int64_t groups = job.edges * job.chunks;
+    if (job.channels == 3) reduce<EDGE_SUMS>(queue, groups, LineariseEdges<S, true>{job}, job.edge_part);
+    else reduce<EDGE_SUMS>(queue, groups, LineariseEdges<S, false>{job}, job.edge_part);
     map(queue, job.edges * EDGE_SUMS, EdgeTotals{job});
     map(queue, job.frames, FreePoses{job});
     if (!job.motion_only) {
@@ -67,7 +69,8 @@ int launch_energy(const Job& job, const void* T_cw, const void* disps, void* mov
     Motion<S>* to = static_cast<Motion<S>*>(moved);
     map(queue, job.edges, RelativeMotions<S>{job, static_cast<const S*>(T_cw), nullptr, to});
     const int64_t groups = job.edges * job.chunks;
-    reduce<1>(queue, groups, MovedEnergy<S>{job, d, to}, job.energy_part);
+    if (job.channels == 3) reduce<1>(queue, groups, MovedEnergy<S, true>{job, d, to}, job.energy_part);
+    else reduce<1>(queue, groups, MovedEnergy<S, false>{job, d, to}, job.energy_part);
     const int64_t chunks = job.prior && !job.motion_only ? job.frames * job.chunks : 0;
     reduce<1>(queue, chunks, PriorEnergy<S>{job, d}, job.energy_part + groups);
     reduce<1>(queue, 1, RowSum{job.energy_part, groups}, job.told + FLAGS);
@@ -85,7 +88,7 @@ int launch_energy(const Job& job, const void* T_cw, const void* disps, void* mov
 #define DW_BY_SIZE(call) (size == 8 ? dw::call<double> : dw::call<float>)
 
 // Raised whenever the layout of a struct or the meaning of an argument changes.
-DW_API int32_t dw_kernels_version() { return 1; }
+DW_API int32_t dw_kernels_version() { return 2; }
 
 DW_API int32_t dw_system(const dw::Job* job, int32_t size, void* stream) {
     return DW_BY_SIZE(launch_system)(*job, stream);

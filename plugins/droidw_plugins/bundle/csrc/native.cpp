@@ -14,7 +14,7 @@
 
 namespace dw {
 
-template <class S>
+template <class S, bool CROSS>
 class Stepper {
   public:
     Stepper(const Problem& p, Workspace<S>& work)
@@ -54,7 +54,7 @@ class Stepper {
             if (!p_.guard) return done();
             std::vector<Motion<double>> moved(p_.edges);
             motions_of(static_cast<const S*>(p_.T_out), moved);
-            const View<S> now(p_, work_, p_.disps_out);
+            const View<S, CROSS> now(p_, work_, p_.disps_out);
             const double after = energy(now, moved.data()) + prior_energy(now.disps);
             if (after <= report_.cost_before) {
                 report_.cost_after = after;
@@ -69,7 +69,7 @@ class Stepper {
   private:
     const Problem& p_;
     Workspace<S>& work_;
-    View<S> start_;
+    View<S, CROSS> start_;
     int threads_;
     bool finite_ = true;
     double energy_ = 0, curvature_ = 0;
@@ -113,8 +113,8 @@ class Stepper {
         parallel(int64_t(units.size()), threads_, [&](int64_t u, int thread) {
             Scratch<S>& mine = work_.scratch[thread];
             Found& found = work_.found[u];
-            if (p_.motion_only) linearise_unit<S, false>(start_, units[u], mine, found);
-            else linearise_unit<S, true>(start_, units[u], mine, found);
+            if (p_.motion_only) linearise_unit<S, CROSS, false>(start_, units[u], mine, found);
+            else linearise_unit<S, CROSS, true>(start_, units[u], mine, found);
         });
         energy_ = curvature_ = 0;
         double dropped = 0;
@@ -191,7 +191,7 @@ class Stepper {
         return p_.prior_weight * sum;
     }
 
-    double energy(const View<S>& now, const Motion<double>* moved) {
+    double energy(const View<S, CROSS>& now, const Motion<double>* moved) {
         const std::vector<Unit>& units = work_.plan.units;
         std::vector<double> parts(units.size());
         parallel(int64_t(units.size()), threads_, [&](int64_t u, int) {
@@ -295,6 +295,11 @@ class Stepper {
     }
 };
 
+template <class S>
+Report step(const Problem& p, Workspace<S>& work) {
+    return p.channels == 3 ? Stepper<S, true>(p, work).run() : Stepper<S, false>(p, work).run();
+}
+
 struct Handle {
     Workspace<float> single;
     Workspace<double> full;
@@ -305,7 +310,7 @@ struct Handle {
 extern "C" {
 
 // Raised whenever the layout of `Problem` or `Report` changes.
-int32_t dw_native_version() { return 1; }
+int32_t dw_native_version() { return 2; }
 
 void* dw_native_open() { return new (std::nothrow) dw::Handle(); }
 
@@ -315,8 +320,7 @@ void dw_native_close(void* handle) { delete static_cast<dw::Handle*>(handle); }
 int32_t dw_native_step(void* handle, const dw::Problem* p, int32_t size, dw::Report* report) {
     try {
         dw::Handle* held = static_cast<dw::Handle*>(handle);
-        *report = size == 8 ? dw::Stepper<double>(*p, held->full).run()
-                            : dw::Stepper<float>(*p, held->single).run();
+        *report = size == 8 ? dw::step(*p, held->full) : dw::step(*p, held->single);
         return 0;
     } catch (const std::bad_alloc&) {
         return 1;

@@ -13,6 +13,7 @@ namespace dw {
 // Mirrors droidw_plugins.bundle._native_calls.Problem; floating arrays are all of one type.
 struct Problem {
     int64_t frames, edges, height, width;
+    int64_t channels;  // of weight: 2, or 3 with the cross term
     const int64_t *ii, *jj;
     const void *T_cw, *disps, *target, *weight, *damping, *prior;  // prior may be null
     const uint8_t* fixed;

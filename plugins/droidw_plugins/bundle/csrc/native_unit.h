@@ -23,14 +23,25 @@ struct Reader {
             y.v[k] = from[2 * k + 1];
         }
     }
+    static DW_HD void triple(const S* from, int64_t left, R& x, R& y, R& z) {
+        if (left >= R::lanes) return split_triples(from, x, y, z);
+        x = y = z = R(S(0));
+        for (int64_t k = 0; k < left; ++k) {
+            x.v[k] = from[3 * k];
+            y.v[k] = from[3 * k + 1];
+            z.v[k] = from[3 * k + 2];
+        }
+    }
     static DW_HD void write(S* to, int64_t left, R value) {
         if (left >= R::lanes) return value.store(to);
         for (int64_t k = 0; k < left; ++k) to[k] = value.v[k];
     }
 };
 
-template <class S>
+template <class S, bool CROSS>
 struct View {
+    using R = Pack<S>;
+    static constexpr int64_t CHANNELS = CROSS ? 3 : 2;
     const Problem& p;
     Workspace<S>& work;
     Camera<S> K;
@@ -42,21 +53,30 @@ struct View {
         : p(p_), work(work_), huber(S(p_.huber)), disps(static_cast<const S*>(disps_)) {
         K = {S(p.fx), S(p.fy), S(p.cx), S(p.cy)};
     }
-    const S* target(int64_t e) const { return pairs(p.target, e); }
-    const S* weight(int64_t e) const { return pairs(p.weight, e); }
-
-  private:
-    const S* pairs(const void* base, int64_t e) const {
-        return static_cast<const S*>(base) + work.plan.order[e] * 2 * work.plan.cells;
+    const S* target(int64_t e) const {
+        return static_cast<const S*>(p.target) + work.plan.order[e] * 2 * work.plan.cells;
+    }
+    const S* weight(int64_t e) const {
+        return static_cast<const S*>(p.weight) + work.plan.order[e] * CHANNELS * work.plan.cells;
+    }
+    // Matches from cell `at` of an edge on; a target that is not wanted may be null.
+    static DW_HD Match<R> match(const S* target, const S* weight, int64_t at, int64_t left) {
+        Match<R> m;
+        m.tu = m.tv = m.cross = R(S(0));
+        if (target) Reader<S>::pair(target + 2 * at, left, m.tu, m.tv);
+        if constexpr (CROSS) Reader<S>::triple(weight + 3 * at, left, m.wu, m.wv, m.cross);
+        else Reader<S>::pair(weight + 2 * at, left, m.wu, m.wv);
+        return m;
     }
 };
 
 // Rows of one edge over a block of cells: sums to `lanes`, E to its buffer, C and w added up.
-template <class S, bool POSE, bool DEPTH>
-void edge_block(const View<S>& view, int64_t e, const Motion<S> G, const S* d, int64_t first,
+template <class S, bool CROSS, bool POSE, bool DEPTH>
+void edge_block(const View<S, CROSS>& view, int64_t e, const Motion<S> G, const S* d, int64_t first,
                 int64_t n, Pack<S>* lanes, S* E, S* C, S* w, Pack<S>& energy, Pack<S>& dropped) {
     using R = Pack<S>;
-    const S *target = view.target(e) + 2 * first, *weight = view.weight(e) + 2 * first;
+    const S *target = view.target(e) + 2 * first;
+    const S *weight = view.weight(e) + view.CHANNELS * first;
     const S *ray_x = view.work.ray_x.data() + first, *ray_y = view.work.ray_y.data() + first;
     // copies that no store below can change, for all that the compiler knows
     const Camera<S> K = view.K;
@@ -64,23 +84,21 @@ void edge_block(const View<S>& view, int64_t e, const Motion<S> G, const S* d, i
     const bool check = view.check;
     R energies(S(0));
     for (int64_t at = 0; at < n; at += R::lanes) {
-        R tu, tv, wu, wv;
-        Reader<S>::pair(target + 2 * at, n - at, tu, tv);
-        Reader<S>::pair(weight + 2 * at, n - at, wu, wv);
-        if (check) dropped += drop_nonfinite(tu, tv, wu, wv);
+        Match<R> t = view.match(target, weight, at, n - at);
+        if (check) dropped += drop_nonfinite<CROSS>(t);
         const R here = R::load(d + at);
         const Seen<R> p = project(G, R::load(ray_x + at), R::load(ray_y + at), here);
-        const Measured<R> m = measure(K, p, p.ok, tu, tv, wu, wv, huber);
+        const Measured<R> m = measure<CROSS>(K, p, p.ok, t, huber);
         energies += m.energy;
         if (!POSE && !DEPTH) continue;
-        const Linear<R> l = linearise(K, G, p, m, here);
+        const Linear<R> l = linearise<CROSS>(K, G, p, m, here);
         if (DEPTH) {
             (R::load(C + at) + depth_curvature(l)).store(C + at);
             (R::load(w + at) + depth_gradient(l)).store(w + at);
         }
         if (POSE && DEPTH) {
             R row[6];
-            coupling(l, row);
+            coupling<CROSS>(l, row);
             row[0].store(E + at);
             row[1].store(E + PLANE + at);
             row[2].store(E + 2 * PLANE + at);
@@ -88,7 +106,7 @@ void edge_block(const View<S>& view, int64_t e, const Motion<S> G, const S* d, i
             row[4].store(E + 4 * PLANE + at);
             row[5].store(E + 5 * PLANE + at);
         }
-        if (POSE) add_pose_sums(l, lanes);
+        if (POSE) add_pose_sums<CROSS>(l, lanes);
     }
     energy += energies;
 }
@@ -134,8 +152,8 @@ void row_sums(const S* Ea, const S* row, int64_t n, Pack<S>* lanes) {
 }
 
 // The sums of a unit: poses of every active edge, E Q rhs, and E Q E^T of every pair of edges.
-template <class S, bool DEPTH>
-void linearise_unit(const View<S>& view, const Unit& unit, Scratch<S>& mine, Found& found) {
+template <class S, bool CROSS, bool DEPTH>
+void linearise_unit(const View<S, CROSS>& view, const Unit& unit, Scratch<S>& mine, Found& found) {
     using R = Pack<S>;
     Workspace<S>& work = view.work;
     const Source& source = work.plan.sources[unit.source];
@@ -161,11 +179,11 @@ void linearise_unit(const View<S>& view, const Unit& unit, Scratch<S>& mine, Fou
             const Motion<S> G = rounded<S>(work.motions[e]);
             const int64_t a = e - source.first;
             if (e < source.active)
-                edge_block<S, true, DEPTH>(
+                edge_block<S, CROSS, true, DEPTH>(
                     view, e, G, d, first, n, lanes + a * POSE_SUMS, mine.E.data() + a * 6 * PLANE,
                     C, w, energy, dropped);
             else
-                edge_block<S, false, DEPTH>(
+                edge_block<S, CROSS, false, DEPTH>(
                     view, e, G, d, first, n, nullptr, nullptr, C, w, energy, dropped);
         }
         if (!DEPTH) continue;
@@ -210,8 +228,8 @@ void linearise_unit(const View<S>& view, const Unit& unit, Scratch<S>& mine, Fou
 
 // Disparity steps Q (rhs - E^T y) of a unit, with E computed once more: that is less work than to
 // store and load it. `steps` [edges,6] is what every edge sees of the pose steps.
-template <class S>
-void substitute_unit(const View<S>& view, const Unit& unit, const double* steps) {
+template <class S, bool CROSS>
+void substitute_unit(const View<S, CROSS>& view, const Unit& unit, const double* steps) {
     using R = Pack<S>;
     Workspace<S>& work = view.work;
     const Source& source = work.plan.sources[unit.source];
@@ -237,19 +255,18 @@ void substitute_unit(const View<S>& view, const Unit& unit, const double* steps)
             }
             if (!moves) continue;
             const Motion<S> G = rounded<S>(work.motions[e]);
-            const S *target = view.target(e) + 2 * first, *weight = view.weight(e) + 2 * first;
+            const S* const target = residuals ? view.target(e) + 2 * first : nullptr;
+            const S* const weight = view.weight(e) + view.CHANNELS * first;
             for (int64_t at = 0; at < n; at += R::lanes) {
-                R tu(S(0)), tv(S(0)), wu, wv;
-                if (residuals) Reader<S>::pair(target + 2 * at, n - at, tu, tv);
-                Reader<S>::pair(weight + 2 * at, n - at, wu, wv);
-                if (view.check) drop_nonfinite(tu, tv, wu, wv);
+                Match<R> t = view.match(target, weight, at, n - at);
+                if (view.check) drop_nonfinite<CROSS>(t);
                 const R here = R::load(d + at);
                 const Seen<R> p = project(
                     G, R::load(work.ray_x.data() + first + at),
                     R::load(work.ray_y.data() + first + at), here);
-                const Measured<R> m = measure(K, p, p.ok, tu, tv, wu, wv, huber);
-                const Linear<R> l = linearise(K, G, p, m, here);
-                (R::load(sum + at) - coupled_step(l, y)).store(sum + at);
+                const Measured<R> m = measure<CROSS>(K, p, p.ok, t, huber);
+                const Linear<R> l = linearise<CROSS>(K, G, p, m, here);
+                (R::load(sum + at) - coupled_step<CROSS>(l, y)).store(sum + at);
             }
         }
         const S* const Q = work.Q.data() + unit.source * cells + first;
@@ -259,9 +276,9 @@ void substitute_unit(const View<S>& view, const Unit& unit, const double* steps)
 }
 
 // Energy of another state over the cells that passed the near test at the start of the step.
-template <class S>
-double energy_unit(const View<S>& start, const View<S>& now, const Motion<double>* moved,
-                   const Unit& unit) {
+template <class S, bool CROSS>
+double energy_unit(const View<S, CROSS>& start, const View<S, CROSS>& now,
+                   const Motion<double>* moved, const Unit& unit) {
     using R = Pack<S>;
     Workspace<S>& work = start.work;
     const Source& source = work.plan.sources[unit.source];
@@ -272,15 +289,13 @@ double energy_unit(const View<S>& start, const View<S>& now, const Motion<double
         const S *target = start.target(e), *weight = start.weight(e);
         for (int64_t at = unit.begin; at < unit.end; at += R::lanes) {
             const int64_t left = unit.end - at;
-            R tu, tv, wu, wv;
-            Reader<S>::pair(target + 2 * at, left, tu, tv);
-            Reader<S>::pair(weight + 2 * at, left, wu, wv);
-            if (start.check) drop_nonfinite(tu, tv, wu, wv);
+            Match<R> t = start.match(target, weight, at, left);
+            if (start.check) drop_nonfinite<CROSS>(t);
             const R x = R::load(work.ray_x.data() + at), y = R::load(work.ray_y.data() + at);
             const R before = depth_ratio(G0, x, y, Reader<S>::one(start.disps + frame + at, left));
             const R ok = select(before >= R(S(NEAR_DEPTH)), R(S(1)), R(S(0)));
             const Seen<R> p = project(G, x, y, Reader<S>::one(now.disps + frame + at, left));
-            energy += measure(start.K, p, ok, tu, tv, wu, wv, start.huber).energy;
+            energy += measure<CROSS>(start.K, p, ok, t, start.huber).energy;
         }
     }
     return total(energy);

@@ -139,6 +139,32 @@ DW_HD void split_pairs(const S* from, Pack<S>& x, Pack<S>& y) {
 #endif
 }
 
+// Separates triples (x0 y0 z0 x1 ...) into x, y and z. No two numbers of one of them have the same
+// lane in the three registers that hold them: blended into one, they only need another order.
+template <class S>
+DW_HD void split_triples(const S* from, Pack<S>& x, Pack<S>& y, Pack<S>& z) {
+    constexpr int n = Pack<S>::lanes;
+    using V = typename Register<S>::type;
+    const V low = Pack<S>::load(from).v, middle = Pack<S>::load(from + n).v;
+    const V high = Pack<S>::load(from + 2 * n).v;
+    Pack<S>* const out[3] = {&x, &y, &z};
+    for (int c = 0; c < 3; ++c) {
+        typename Register<S>::mask second, third, order;
+        for (int k = 0; k < n; ++k) {
+            const int at = 3 * k + c;
+            order[k] = at % n;
+            second[at % n] = at / n == 1 ? -1 : 0;
+            third[at % n] = at / n == 2 ? -1 : 0;
+        }
+        const V mixed = third ? high : (second ? middle : low);
+#if defined(__clang__)
+        for (int k = 0; k < n; ++k) out[c]->v[k] = mixed[(3 * k + c) % n];
+#else
+        out[c]->v = __builtin_shuffle(mixed, order);
+#endif
+    }
+}
+
 #if defined(__AVX2__) && DW_BYTES == 32
 template <>
 DW_HD Pack<float> root<float>(Pack<float> x) {

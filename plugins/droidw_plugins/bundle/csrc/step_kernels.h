@@ -26,23 +26,23 @@ struct RelativeMotions {
 };
 
 // Sums over the cells of an edge, a chunk per group; E, curvature and gradient of every cell.
-template <class S>
+template <class S, bool CROSS>
 struct LineariseEdges {
     using Sum = S;
     Job job;
     DW_KERNEL int64_t items(int64_t group) const { return job.cells_of_chunk(group % job.chunks); }
     DW_KERNEL void operator()(int64_t group, int64_t item, S* sums) const {
         const int64_t e = group / job.chunks, cell = (group % job.chunks) * job.chunk + item;
-        const Cell<S> c(job, e, cell);
+        const Cell<S, CROSS> c(job, e, cell);
         const Seen<S> p = project(c.G, c.x, c.y, c.d);
-        const Measured<S> m = measure(c.K, p, p.ok, c.tu, c.tv, c.wu, c.wv, S(job.huber));
-        const Linear<S> l = linearise(c.K, c.G, p, m, c.d);
-        if (job.ii[e] != job.jj[e]) add_pose_sums(l, sums);
+        const Measured<S> m = measure<CROSS>(c.K, p, p.ok, c.match, S(job.huber));
+        const Linear<S> l = linearise<CROSS>(c.K, c.G, p, m, c.d);
+        if (job.ii[e] != job.jj[e]) add_pose_sums<CROSS>(l, sums);
         sums[ENERGY] += m.energy;
         sums[DROPPED] += c.dropped;
         if (job.motion_only) return;
         S E[6];
-        coupling(l, E);
+        coupling<CROSS>(l, E);
         const int64_t n = job.cells();
         for (int k = 0; k < 6; ++k) static_cast<S*>(job.E)[(6 * e + k) * n + cell] = E[k];
         static_cast<S*>(job.curvature)[e * n + cell] = depth_curvature(l);
@@ -320,7 +320,7 @@ struct MoveDepths {
 };
 
 // Energy of another state over the cells that passed the near test at the start of the step.
-template <class S>
+template <class S, bool CROSS>
 struct MovedEnergy {
     using Sum = S;
     Job job;
@@ -329,10 +329,10 @@ struct MovedEnergy {
     DW_KERNEL int64_t items(int64_t group) const { return job.cells_of_chunk(group % job.chunks); }
     DW_KERNEL void operator()(int64_t group, int64_t item, S* sums) const {
         const int64_t e = group / job.chunks, cell = (group % job.chunks) * job.chunk + item;
-        const Cell<S> c(job, e, cell);
+        const Cell<S, CROSS> c(job, e, cell);
         const S ok = depth_ratio(c.G, c.x, c.y, c.d) >= S(NEAR_DEPTH) ? S(1) : S(0);
         const Seen<S> p = project(moved[e], c.x, c.y, disps[job.ii[e] * job.cells() + cell]);
-        sums[0] += measure(c.K, p, ok, c.tu, c.tv, c.wu, c.wv, S(job.huber)).energy;
+        sums[0] += measure<CROSS>(c.K, p, ok, c.match, S(job.huber)).energy;
     }
 };
 
