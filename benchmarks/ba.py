@@ -59,6 +59,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9, help="steps per median (default 9)")
     parser.add_argument("--most", type=int, default=1000, help="no windows of more keyframes")
     parser.add_argument("--huber", type=float, default=0.0, help="Huber threshold (0: none)")
+    parser.add_argument(
+        "--cross", action="store_true", help="weights with an off-diagonal: three channels"
+    )
     parser.add_argument("--quick", action="store_true", help="the smallest window only")
     parser.add_argument("--save", action="store_true", help="write results/ba.json and ba.md")
     parser.add_argument("--memory-of", nargs=5, help=argparse.SUPPRESS)
@@ -73,7 +76,8 @@ def main() -> None:
     rows = []
     for h, w in GRIDS[:1] if args.quick else GRIDS:
         for keyframes, edges in windows:
-            row = measure(built, speeds, keyframes, edges, h, w, args.repeats, args.huber)
+            problem = window(keyframes, edges, h, w, args.huber, args.cross)
+            row = measure(built, speeds, problem, args.repeats)
             rows.append(row)
             print(line(row), flush=True)
     record = {
@@ -81,6 +85,7 @@ def main() -> None:
         "machine": facts(args.threads),
         "repeats": args.repeats,
         "huber": args.huber,
+        "cross": args.cross,
         "ceilings": speeds,
         "rows": rows,
     }
@@ -105,9 +110,20 @@ def build(name: str) -> BundleAdjuster | None:
         return None
 
 
-def window(keyframes: int, edges: int, h: int, w: int, huber: float, device: str) -> BAProblem:
-    """A window of `ba_step`, in float32 on a device."""
+def window(
+    keyframes: int, edges: int, h: int, w: int, huber: float = 0.0, cross: bool = False
+) -> BAProblem:
+    """A window of `ba_step`, in float32 on the CPU."""
     p = replace(make_window(keyframes, edges, h, w, torch.float32), huber=huber or None)
+    if not cross:
+        return p
+    tilt = 2 * torch.rand(p.weight.shape[:3], generator=torch.Generator().manual_seed(1)) - 1
+    off = tilt * p.weight.prod(-1).sqrt()
+    return replace(p, weight=torch.cat((p.weight, off[..., None]), dim=-1))
+
+
+def on(device: str, p: BAProblem) -> BAProblem:
+    """The same problem on a device."""
     moved = {k: v.to(device) for k, v in vars(p).items() if isinstance(v, torch.Tensor)}
     return replace(p, **moved)
 
@@ -115,18 +131,13 @@ def window(keyframes: int, edges: int, h: int, w: int, huber: float, device: str
 def measure(
     built: dict[str, BundleAdjuster],
     speeds: dict[str, dict[str, float]],
-    keyframes: int,
-    edges: int,
-    h: int,
-    w: int,
+    problem: BAProblem,
     repeats: int,
-    huber: float,
 ) -> dict[str, Any]:
     """One row: milliseconds (median, least), memory, and floors of every backend."""
-    problems = {
-        device: window(keyframes, edges, h, w, huber, device)
-        for device in {BACKENDS[name][1] for name in built}
-    }
+    keyframes, h, w = problem.disps.shape
+    edges = len(problem.ii)
+    problems = {device: on(device, problem) for device in {BACKENDS[name][1] for name in built}}
     times: dict[str, list[float]] = {name: [] for name in built}
     repeats = repeats if edges < 1000 else max(3, repeats // 3)
     for turn in range(repeats + 1):
@@ -174,7 +185,7 @@ def work(p: BAProblem) -> dict[str, float]:
     pairs = float((degree * (degree + 1) // 2).sum())
     cells = h * w
     return {
-        "bytes": float(cells * (edges * EDGE_BYTES + n * FRAME_BYTES)),
+        "bytes": float(cells * (edges * (EDGE_BYTES + 4 * (p.channels - 2)) + n * FRAME_BYTES)),
         "flops": cells * (edges * (EDGE_FLOPS + BACK_FLOPS) + pairs * PAIR_FLOPS),
     }
 
@@ -216,8 +227,8 @@ def memory_of(name: str, *size: str) -> float:
     """MB (10^6 bytes) that three steps add to a process, beyond the problem itself."""
     component, device = BACKENDS[name]
     adjuster = component.factory(component.options(), BuildContext(device=torch.device(device)))
-    adjuster.step(window(2, 2, 3, 4, 0.0, device))  # libraries that load at first use
-    p = window(*(int(x) for x in size), 0.0, device)  # type: ignore[arg-type]
+    adjuster.step(on(device, window(2, 2, 3, 4)))  # libraries that load at first use
+    p = on(device, window(*(int(x) for x in size)))  # type: ignore[arg-type]
     if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
         before = float(torch.cuda.memory_allocated())
@@ -293,7 +304,8 @@ def table(record: dict[str, Any]) -> str:
         f"GPU: {machine['gpu']}; torch {machine['torch']}; load {machine['load']:.1f} at the end.",
         f"Median of {record['repeats']} steps in turn (a third of that from 350 keyframes on), "
         "least in brackets; float32"
-        + (f", Huber threshold {record['huber']:g}." if record["huber"] else ", no robust kernel."),
+        + (f", Huber threshold {record['huber']:g}" if record["huber"] else ", no robust kernel")
+        + (", weights with an off-diagonal." if record["cross"] else "."),
         "Memory is what a step adds to the problem, beyond memory that was free already.",
         "",
         "| keyframes | edges | grid | backend | ms | of torch | floor ms | memory MB |",

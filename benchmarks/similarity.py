@@ -92,8 +92,8 @@ def extractors(weights: Path) -> dict[str, Callable[[], Any]]:
 class Pair:
     """Two pictures [3,H,W] with moving objects and what is known of them.
 
-    `target` [h,w,2] and `confidence` [h,w,2] are measured on them; `background` [h,w,2] is where
-    the place behind each cell lies in the second; `still` and `moving` [P] say which cells count.
+    `target` [h,w,2] and `confidence` [h,w,2 or 3] are measured on them; `background` [h,w,2] is
+    where the place behind each cell lies in the second; `still`, `moving` [P] say what counts.
     """
 
     first: torch.Tensor
@@ -116,7 +116,7 @@ def picture(path: Path) -> torch.Tensor:
 
 
 def measured(first: torch.Tensor, second: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Target and confidence [h,w,2] that `flow` gives for two pictures."""
+    """Target [h,w,2] and confidence [h,w,3] that `flow` gives for two pictures."""
     part = flow.COMPONENT.factory(flow.COMPONENT.options(), CPU)
     known = torch.tensor([260.0, 260.0, 159.5, 119.5])
     frames = [Frame(n, n / 30, image, known) for n, image in enumerate((first, second))]
@@ -144,7 +144,7 @@ def folder_pairs(clean: Path, moving: Path, gap: int, count: int) -> Iterator[Pa
         here, there = (picture(m)[0] > 0.5 for m in masks)
         covered = GRID.covered(here).flatten()
         hit = at(GRID.covered(there), background)
-        seen = (sure.mean(-1) > 0).flatten()
+        seen = (sure[..., :2].mean(-1) > 0).flatten()
         yield Pair(
             first, second, *measured(first, second), background,
             seen & (covered == 0) & (hit == 0), seen & (covered > 0.99),

@@ -12,6 +12,12 @@ from droidw.geometry.transfer import on_device
 __all__ = ["FactorGraph"]
 
 
+def _padded(confidence: Tensor, channels: int) -> Tensor:
+    """The same information with zeros as its last channels."""
+    missing = channels - confidence.shape[-1]
+    return torch.nn.functional.pad(confidence, (0, missing)) if missing > 0 else confidence
+
+
 class FactorGraph:
     """Edges i -> j with their measured targets and confidences.
 
@@ -20,7 +26,9 @@ class FactorGraph:
 
     Attributes:
         ids, ii, jj, age, active: one entry per edge. `ids` never repeat within a graph.
-        target, confidence: [E,h,w,2], cells; rows in the order of the lists.
+        target: [E,h,w,2], cells; rows in the order of the lists.
+        confidence: [E,h,w,2] or, from the first answer with an off-diagonal on, [E,h,w,3]; see
+            `EdgeUpdate`.
     """
 
     def __init__(self, height: int, width: int, device: torch.device | str = "cpu") -> None:
@@ -61,10 +69,18 @@ class FactorGraph:
             self.active.append(True)
         new = len(self) - first
         if new:
-            blank = self.target.new_zeros(new, *self.target.shape[1:])
-            self.target = torch.cat([self.target, blank])
-            self.confidence = torch.cat([self.confidence, blank])
+            for name in ("target", "confidence"):
+                held = getattr(self, name)
+                setattr(self, name, torch.cat([held, held.new_zeros(new, *held.shape[1:])]))
         return list(range(first, len(self)))
+
+    def record(self, rows: Sequence[int], target: Tensor, confidence: Tensor) -> None:
+        """Keep what was measured of these edges; where channels are missing, they are 0."""
+        at = on_device(rows, self.target.device)
+        if confidence.shape[-1] > self.confidence.shape[-1]:
+            self.confidence = _padded(self.confidence, confidence.shape[-1])
+        self.target[at] = target
+        self.confidence[at] = _padded(confidence, self.confidence.shape[-1])
 
     def retire(self, rows: Iterable[int]) -> list[int]:
         """Make edges inactive; returns their ids, whose correspondence state may be dropped."""

@@ -61,8 +61,10 @@ class EdgeUpdate:
 
     Attributes:
         target: [E,h,w,2] float32, measured position of each cell of i in j, cells, x then y.
-        confidence: [E,h,w,2] float32 >= 0, weight of the x and of the y measurement; the scale
-            belongs to the correspondence and is matched by the preset's damping.
+        confidence: [E,h,w,2] (xx, yy) or [E,h,w,3] (xx, yy, xy) float32, the information
+            [[xx, xy], [xy, yy]] of the position: xx, yy >= 0, the weights of x and of y, and
+            |xy| <= sqrt(xx yy) but for rounding; two channels mean xy = 0 (docs/conventions.md).
+            The scale belongs to the correspondence and is matched by the preset's damping.
         damping: [U,h,w] learned depth damping of the source frames, or None.
         sources: the U node numbers of `damping` and `upmask`, ascending, or None.
         upmask: [U,576,h,w] convex upsampling mask, or None.

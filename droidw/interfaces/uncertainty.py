@@ -48,7 +48,9 @@ class UncertaintyView:
         fields: the model's own `StoreField`s by name, [N,...], written in place.
         T_cw: [N,7] world to camera. disps: [N,h,w]. intrinsics: [4] of the grid.
         ii, jj: [E] int64 edges given to this bundle adjustment call.
-        target: [E,h,w,2] measured correspondence in cells; confidence: [E,h,w,2].
+        target: [E,h,w,2] measured correspondence in cells.
+        confidence: [E,h,w,2] or [E,h,w,3], the information of these as in `EdgeUpdate`; the mean of
+            the first two channels says how sure a match is on the whole.
         frames: [K] int64 keyframes whose maps are to be refreshed.
         iteration: counts updates since the start of the run.
         host: `ii`, `jj` and `frames` once more as lists; see `indices`.

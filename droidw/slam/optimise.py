@@ -107,9 +107,7 @@ class Optimiser:
         )
         with self.clock("correspondence"):
             answer = session.update(request)
-        at = on_device(rows, store.device)
-        graph.target[at] = answer.target
-        graph.confidence[at] = answer.confidence
+        graph.record(rows, answer.target, answer.confidence)
         if answer.damping is not None and answer.sources is not None:
             store["damping"][on_device(answer.sources, store.device)] = answer.damping
 

@@ -69,7 +69,7 @@ def residual_weights(
     """Weights of all residuals: `scale * confidence * gate of the source * validity`.
 
     Args:
-        confidence: [E,h,w,2] >= 0.
+        confidence: [E,h,w,2] or [E,h,w,3], the information of a match as in `EdgeUpdate`.
         valid: [E,h,w] bool, or None where every cell is valid.
         gates: [N,h,w] in [0,1] from `gate`, or None to leave uncertainty out.
         ii, jj: [E] int64 into `gates`.
@@ -78,8 +78,8 @@ def residual_weights(
             lies inside the grid (off in the published system).
         scale: factor on the confidence (0.001 for the published network's).
     Returns:
-        [E,h,w,2], a fresh tensor; confidences that are not finite stay so, for bundle adjustment
-        counts and drops them.
+        The shape of `confidence`, a fresh tensor; confidences that are not finite stay so, for
+        bundle adjustment counts and drops them.
     """
     weight = confidence * scale
     if gates is not None:

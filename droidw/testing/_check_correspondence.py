@@ -127,10 +127,20 @@ def _ask(subject: Subject, session: EdgeSession, request: EdgeRequest, label: st
     )
     shape = tuple(request.coords.shape)
     subject.tensor(f"the target for {label}", update.target, shape)
-    subject.tensor(f"the confidence for {label}", update.confidence, shape)
+    channels = 3 if update.confidence.shape[-1:] == (3,) else 2
+    subject.tensor(f"the confidence for {label}", update.confidence, (*shape[:3], channels))
     subject.expect(
-        "range", bool((update.confidence >= 0).all()), f"a confidence is negative for {label}"
+        "range",
+        bool((update.confidence[..., :2] >= 0).all()),
+        f"a confidence is negative for {label}",
     )
+    if channels == 3:
+        xx, yy, xy = update.confidence.double().unbind(-1)
+        subject.expect(
+            "range",
+            bool((xy.square() <= xx * yy + 1e-5 * (xx + yy).square()).all()),
+            f"the off-diagonal of a confidence is beyond sqrt(xx yy) for {label}",
+        )
     if update.damping is not None or update.upmask is not None:
         sources = sorted(set(request.ii))
         subject.expect(
@@ -202,7 +212,7 @@ def _accuracy(subject: Subject, scene: Scene, update: EdgeUpdate, grid: Grid, la
     for number, (i, j) in enumerate(_EDGES):
         truth = scene.correspond(_INDICES[i], _INDICES[j], cells)
         target = update.target[number].cpu().double().numpy() * grid.stride + grid.offset
-        confidence = update.confidence[number].amax(dim=-1).cpu().numpy()
+        confidence = update.confidence[number, ..., :2].amax(dim=-1).cpu().numpy()
         sure = confidence > 0.5 * confidence.max() if confidence.max() > 0 else confidence > 0
         subject.expect(
             "accuracy",

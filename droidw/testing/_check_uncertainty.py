@@ -105,6 +105,11 @@ def _run(subject: Subject, part: Any, channels: int, dtype: torch.dtype, label: 
     with subject.calling("update with calibrated similarities"):
         part.update(calibrated)
     _maps(subject, view, "after an update with calibrated similarities")
+    half = 0.5 * view.confidence.prod(-1, keepdim=True).sqrt()
+    full = dataclasses.replace(view, confidence=torch.cat([view.confidence, half], dim=-1))
+    with subject.calling("update with an off-diagonal in the confidence"):
+        part.update(full)
+    _maps(subject, view, "after an update with an off-diagonal in the confidence")
     blind = dataclasses.replace(view, confidence=torch.zeros_like(view.confidence), iteration=2)
     with subject.calling("update without any confidence"):
         part.update(blind)

@@ -124,9 +124,9 @@ def check_uncertainty_model(
 
     Clauses: `fields` are `StoreField`s of distinct names; `append` and `update` write finite maps
     >= 0 (`range`) in place and touch `only-asked` keyframes; full and half precision features,
-    none at all unless the capability "features" is claimed, no confidence and no edges are all
-    taken; `report` is finite; `state`: a model restored from `state_dict()` continues as the
-    original.
+    none at all unless the capability "features" is claimed, confidence with an off-diagonal, no
+    confidence and no edges are all taken; `report` is finite; `state`: a model restored from
+    `state_dict()` continues as the original.
 
     Raises:
         AssertionError: a clause does not hold.
@@ -161,7 +161,8 @@ def check_correspondence(
 ) -> None:
     """Hold a correspondence operator against `droidw.interfaces.correspondence`.
 
-    Clauses: `grid` is possible; confidence >= 0 (`range`); answers in the `order` of the request,
+    Clauses: `grid` is possible; `range`: confidence >= 0 and, where it has an off-diagonal, a
+    positive semidefinite matrix; answers in the `order` of the request,
     also for no edges, known and new ones, and for every purpose; `sources` fit damping and upmask;
     `forget` ignores unknown ids and frees known ones; `accuracy`: on rendered pictures 3 frames
     apart the median error of confident cells is below 2 pixels; `motion` of a frame against

@@ -326,6 +326,11 @@ def deaf(request, update):
     return update
 
 
+def tilted(confidence, share):
+    off = share * confidence.prod(-1, keepdim=True).sqrt()
+    return torch.cat([confidence, off], dim=-1)
+
+
 def reversed_answers(request, update):
     order = torch.tensor(np.argsort(request.ids), dtype=torch.long)
     return EdgeUpdate(update.target[order], update.confidence[order])
@@ -336,6 +341,7 @@ def reversed_answers(request, update):
     [
         ("shape", lambda r, u: EdgeUpdate(u.target[..., 0], u.confidence)),
         ("range", lambda r, u: EdgeUpdate(u.target, u.confidence - 1)),
+        ("range", lambda r, u: EdgeUpdate(u.target, tilted(u.confidence, 1.1))),
         ("accuracy", lambda r, u: EdgeUpdate(u.target + 3, u.confidence)),
         ("order", reversed_answers),
         ("forget", deaf),

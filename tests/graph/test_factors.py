@@ -113,3 +113,34 @@ def test_remove_keyframe_against_a_plain_model(seed):
             count += 1
         assert dict(zip(graph.ids, graph.pairs, strict=True)) == model
         check(graph)
+
+
+def full(count, value):
+    """Information of `count` edges of 2x3 cells."""
+    return torch.tensor([2.0, 3.0, value]).expand(count, 2, 3, 3)
+
+
+def test_two_channels_stay_two_and_are_kept_as_they_are():
+    graph = graph_of((0, 1), (1, 0), (1, 2))
+    target, confidence = torch.randn(2, 2, 3, 2), torch.rand(2, 2, 3, 2)
+    graph.record([2, 0], target, confidence)
+    assert graph.confidence.shape == (3, 2, 3, 2)
+    assert torch.equal(graph.confidence[[2, 0]], confidence)
+    assert torch.equal(graph.target[[2, 0]], target)
+    assert (graph.target[1] == 1).all()
+
+
+def test_the_first_off_diagonal_makes_room_for_all():
+    graph = graph_of((0, 1), (1, 0), (1, 2))
+    graph.record([1], torch.ones(1, 2, 3, 2), full(1, 0.5))
+    assert graph.confidence.shape == (3, 2, 3, 3)
+    assert torch.equal(graph.confidence[1:2], full(1, 0.5))
+    assert (graph.confidence[2] == torch.tensor([-2.0, -2.0, 0.0])).all()
+    # later answers of two channels have no off-diagonal, new edges nothing at all
+    graph.record([1], torch.ones(1, 2, 3, 2), full(1, 0.0)[..., :2])
+    assert torch.equal(graph.confidence[1:2], full(1, 0.0))
+    graph.add([(2, 1)])
+    assert graph.confidence.shape == (4, 2, 3, 3)
+    assert (graph.confidence[3] == 0).all()
+    graph.drop([0])
+    assert torch.equal(graph.confidence[0:1], full(1, 0.0))

@@ -46,6 +46,16 @@ def _edges() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     return confidence, gates, torch.tensor([0, 1, 2]), torch.tensor([1, 2, 0])
 
 
+def test_a_gate_scales_the_whole_information() -> None:
+    confidence, gates, ii, jj = _edges()
+    full = torch.cat([confidence, -0.5 * confidence.prod(-1, keepdim=True).sqrt()], dim=-1)
+    target = torch.full((3, 4, 5, 2), 1.5)
+    weight = residual_weights(full, None, gates, ii, jj, target, bidirectional=True, scale=0.1)
+    plain = residual_weights(confidence, None, gates, ii, jj, target, bidirectional=True, scale=0.1)
+    assert torch.equal(weight[..., :2], plain)
+    assert torch.allclose(weight[..., 2], -0.5 * plain.prod(-1).sqrt())
+
+
 def test_weights_multiply_scale_gate_of_the_source_and_validity() -> None:
     confidence, gates, ii, jj = _edges()
     valid = torch.zeros(3, 4, 5, dtype=torch.bool)

@@ -80,6 +80,24 @@ def test_residuals_change_what_is_written_and_not_what_is_learned(
 
 
 @EACH
+def test_the_off_diagonal_of_confidence_says_nothing_of_how_sure_it_is(
+    module: Any, started: Start
+) -> None:
+    maps = []
+    for off in (None, 0.0, -0.7):
+        model = _model(module, residual_gain=0.3)
+        view = replace(_measured(started(model)), calibrate=True)
+        if off is not None:
+            confidence = torch.nn.functional.pad(view.confidence, (0, 1), value=off)
+            view = replace(view, confidence=confidence)
+        for _ in range(2):
+            model.update(view)
+        maps.append(view.uncertainty)
+    assert torch.equal(maps[1], maps[0])
+    assert torch.equal(maps[2], maps[0])
+
+
+@EACH
 def test_a_new_keyframe_and_one_without_edges_are_not_weighed(module: Any, started: Start) -> None:
     model, plain = _model(module, residual_gain=0.3), _model(module)
     view, other = _measured(started(model)), started(plain)

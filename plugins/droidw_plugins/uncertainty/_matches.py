@@ -112,7 +112,7 @@ def matches(
     # Every n-th: a few edges tell the quantiles well enough.
     edges = upload(edges[:: -(-len(edges) // _EDGES)].contiguous(), view.disps.device)
     xy = view.target[edges].flatten(1, 2).transpose(1, 2).contiguous()
-    weight = view.confidence[edges].mean(-1).flatten(1)
+    weight = view.confidence[edges, ..., :2].mean(-1).flatten(1)
     width = view.disps.shape[2]
     ii, jj = view.ii[edges] - first, view.jj[edges] - first
     samples = objective.make_samples(xy, weight > 0, width, ii, jj)

@@ -98,7 +98,7 @@ class Publisher:
         apart = view.target.movedim(-1, 1) - xy.view(shape[0], 2, *shape[1:])
         factor = residual_factor(
             torch.linalg.vector_norm(apart, dim=1),
-            view.confidence.mean(-1) * valid.view(shape),
+            view.confidence[..., :2].mean(-1) * valid.view(shape),
             view.ii - first,
             last - first,
             options.residual_scale,
