@@ -14,6 +14,12 @@ import cv2
 import numpy as np
 
 from droidw.interfaces.correspondence import Motion, Purpose
+from droidw_plugins.correspondence._flow_information import (
+    information,
+    sample,
+    structure,
+    trust,
+)
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Track
 
@@ -30,8 +36,6 @@ _TRACKED = 0.1
 _GRID_FIELDS = 20_000
 # Median distance of two starts, in cells, that lead to the same result.
 _SAME_START = 0.03
-# Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
-_FLAT = 0.1
 # Checked pairs kept for the next session that asks for them: some forty kilobytes each.
 _PAIRS = 4_000
 
@@ -54,25 +58,14 @@ class FlowCorrespondence:
         self._pairs: OrderedDict[tuple[int, int, bool], tuple[Edge, Edge]] = OrderedDict()
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
-        """Grey image and texture at the cells."""
+        """Grey image and its structure at the cells."""
         rgb = cv2.merge(list(frame.image.cpu().numpy()))
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         centres = grid.centres().numpy().astype(np.float32)
-        window = (2 * self.stride - 1, 2 * self.stride - 1)
         scaled = grey * np.float32(255.0)
-        dx = cv2.Scharr(scaled, cv2.CV_32F, 1, 0, scale=1 / 32)
-        dy = cv2.Scharr(scaled, cv2.CV_32F, 0, 1, scale=1 / 32)
-        xx, yy, xy = (
-            _at(cv2.blur(p, window, borderType=cv2.BORDER_REPLICATE), centres)
-            for p in (dx * dx, dy * dy, dx * dy)
-        )
-        # What the window says of x once y is free, and the other way round: an oblique edge,
-        # along which a match may slide, then counts for little in both.
-        alone_x = xx - xy * xy / (yy + _FLAT)
-        alone_y = yy - xy * xy / (xx + _FLAT)
-        texture = np.sqrt(np.maximum(np.stack([alone_x, alone_y], -1), 0.0))
         grey8 = np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
-        return FlowFrame(frame.index, grey8, texture, centres, self.stride)
+        seen = structure(scaled, centres, self.stride)
+        return FlowFrame(frame.index, grey8, *seen, centres, self.stride)
 
     def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:
         """Nothing more is needed of a keyframe."""
@@ -157,7 +150,7 @@ class FlowCorrespondence:
             known = self._grid.get(key)
         if known is not None:
             return known
-        moved = _at(search(a, b), a.centres)
+        moved = sample(search(a, b), a.centres)
         agrees = self._agreement(a, b, moved)
         with self._lock:
             self._grid[key] = (moved, agrees)
@@ -175,7 +168,7 @@ class FlowCorrespondence:
             & (there[..., 0] <= width - 1)
             & (there[..., 1] <= height - 1)
         )
-        difference = np.abs(_at(a.grey, a.centres) - _at(b.grey, there))
+        difference = np.abs(sample(a.grey, a.centres) - sample(b.grey, there))
         # A change of brightness by 10 grey levels is worth two pixels of position where the
         # picture is steep and says nothing where it is flat: texture decides there.
         tolerance = 6.0 + 1.5 * a.texture.max(axis=-1)
@@ -185,7 +178,7 @@ class FlowCorrespondence:
     def one_way(self, a: FlowFrame, b: FlowFrame) -> Edge:
         """Edge a -> b without the way back."""
         moved, agrees = self._one_way(a, b, self._search)
-        confidence = agrees[..., None] * self._texture_weight(a)
+        confidence = information(a, agrees, agrees, self.options.texture)
         target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, None)
 
@@ -248,23 +241,13 @@ class FlowCorrespondence:
         return self._placed[1], self._placed[2]
 
     def _checked(self, a: FlowFrame, ab: Array, ba: Array, started: Array | None) -> Edge:
-        moved = _at(ab, a.centres)
+        moved = sample(ab, a.centres)
         there = a.centres + moved
-        back = _at(ba, there, outside=1e4)
-        error2 = ((moved + back) ** 2).sum(axis=-1)
-        opt = self.options
-        confidence = 1.0 / (1.0 + error2 / opt.consistency**2)
-        confidence[error2 > opt.cutoff**2] = 0.0
-        weight = confidence[..., None].astype(np.float32) * self._texture_weight(a)
+        back = sample(ba, there, outside=1e4)
+        agreed = trust(moved + back, a.normal, self.options)
+        confidence = information(a, *agreed, self.options.texture)
         target = ((there - self.offset) / self.stride).astype(np.float32)
-        return Edge(target, weight, started)
-
-    def _texture_weight(self, a: FlowFrame) -> Array:
-        if self.options.texture <= 0:
-            return np.ones_like(a.texture)
-        t2 = a.texture**2
-        weight: Array = t2 / (t2 + np.float32(self.options.texture**2))
-        return weight
+        return Edge(target, confidence, started)
 
     def map(self, jobs: list[Callable[[], Any]]) -> list[Any]:
         """Run jobs on the pool, results in order."""
@@ -278,18 +261,3 @@ def _close(one: Array | None, other: Array | None) -> bool:
     if one is None or other is None:
         return one is other
     return bool(np.median(np.abs(one - other)) < _SAME_START)
-
-
-def _at(values: Any, points: Array, outside: float | None = None) -> Array:
-    """Bilinear samples of [H,W(,C)] at points [h,w,2]; edge values (or `outside`) beyond."""
-    mode = cv2.BORDER_REPLICATE if outside is None else cv2.BORDER_CONSTANT
-    sampled = cv2.remap(
-        values,
-        np.ascontiguousarray(points[..., 0], dtype=np.float32),
-        np.ascontiguousarray(points[..., 1], dtype=np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=mode,
-        borderValue=(outside or 0.0,) * 4,
-    )
-    result: Array = sampled.astype(np.float32, copy=False)
-    return result

@@ -42,7 +42,8 @@ class FlowSession:
         else:
             self._measure_pairs(request, wanted, coords)
         if not request.ids:
-            return EdgeUpdate(torch.zeros_like(request.coords), torch.zeros_like(request.coords))
+            none = torch.zeros_like(request.coords)
+            return EdgeUpdate(none, none.new_zeros(*none.shape[:3], 3))
         edges = [self._edges[edge_id] for edge_id in request.ids]
         device = request.coords.device
         target = torch.from_numpy(np.stack([e.target for e in edges]))

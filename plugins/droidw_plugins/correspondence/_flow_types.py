@@ -17,22 +17,30 @@ _LONGEST_GAP = 3
 
 @dataclass(frozen=True)
 class FlowFrame:
-    """Payload of one frame: grey image [H,W] uint8 and texture [h,w,2] at the cells.
+    """Payload of one frame: its grey image, and what surrounds each cell of the grid.
 
-    `texture` is the root mean square image derivative that fixes a match along x and along y,
-    in grey levels per pixel, over the neighbourhood of a cell.
+    Attributes:
+        grey: [H,W] uint8.
+        texture: [h,w,2] root mean square image derivative that fixes a match along x and along y,
+            each with the other free, grey levels per pixel.
+        power: [h,w,2] mean square derivative along `normal` and at right angles to it, the
+            eigenvalues of the structure tensor, larger first, (grey levels per pixel)^2.
+        normal: [h,w,2] unit vector across the strongest edge, x and y.
+        centres: [h,w,2] of the cells, pixels.
     """
 
     index: int
     grey: npt.NDArray[np.uint8]
     texture: Array
+    power: Array
+    normal: Array
     centres: Array
     stride: int
 
 
 @dataclass
 class Edge:
-    """What is known of one directed edge: displacement and confidence on the grid."""
+    """What is known of one directed edge: target [h,w,2] in cells, and confidence [h,w,3]."""
 
     target: Array
     confidence: Array

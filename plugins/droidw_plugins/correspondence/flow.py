@@ -43,9 +43,20 @@ class FlowOptions:
     cutoff: float = field(
         default=3.0, metadata={"help": "forward-backward error without any confidence", "gt": 0.0}
     )
+    slide: float = field(
+        default=6.0,
+        metadata={
+            "help": "forward-backward error without any confidence, across an edge along which "
+            "a match may slip",
+            "gt": 0.0,
+        },
+    )
     texture: float = field(
         default=2.0,
-        metadata={"help": "image gradient (grey levels) at which confidence halves", "ge": 0.0},
+        metadata={
+            "help": "image gradient (grey levels) at which confidence along it halves",
+            "ge": 0.0,
+        },
     )
     restart: float = field(
         default=2.0,

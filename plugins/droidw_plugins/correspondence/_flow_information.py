@@ -1,0 +1,106 @@
+"""What a picture and two ways of flow say of a match: how much across its lines, how much along."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+
+from droidw_plugins.correspondence._flow_types import Array
+
+if TYPE_CHECKING:
+    from droidw_plugins.correspondence._flow_types import FlowFrame
+    from droidw_plugins.correspondence.flow import FlowOptions
+
+__all__ = ["information", "sample", "structure", "trust"]
+
+# Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
+_FLAT = 0.1
+
+
+def sample(values: Any, points: Array, outside: float | None = None) -> Array:
+    """Bilinear samples of [H,W(,C)] at points [h,w,2]; edge values (or `outside`) beyond."""
+    mode = cv2.BORDER_REPLICATE if outside is None else cv2.BORDER_CONSTANT
+    sampled = cv2.remap(
+        values,
+        np.ascontiguousarray(points[..., 0], dtype=np.float32),
+        np.ascontiguousarray(points[..., 1], dtype=np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=mode,
+        borderValue=(outside or 0.0,) * 4,
+    )
+    result: Array = sampled.astype(np.float32, copy=False)
+    return result
+
+
+def structure(grey: Array, centres: Array, stride: int) -> tuple[Array, Array, Array]:
+    """The structure tensor (Foerstner and Guelch 1987) of the neighbourhood of each cell.
+
+    Args:
+        grey: [H,W] in grey levels. centres: [h,w,2] pixels. stride: of the grid; a window has
+            twice its width.
+    Returns:
+        `texture`, `power` and `normal` of `FlowFrame`, [h,w,2] each.
+    """
+    window = (2 * stride - 1, 2 * stride - 1)
+    dx = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32)
+    dy = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32)
+    xx, yy, xy = (
+        sample(cv2.blur(p, window, borderType=cv2.BORDER_REPLICATE), centres)
+        for p in (dx * dx, dy * dy, dx * dy)
+    )
+    # What the window says of x once y is free, and the other way round: an oblique edge,
+    # along which a match may slide, then counts for little in both.
+    alone_x = xx - xy * xy / (yy + _FLAT)
+    alone_y = yy - xy * xy / (xx + _FLAT)
+    texture = np.sqrt(np.maximum(np.stack([alone_x, alone_y], -1), 0.0))
+    half, mean = (xx - yy) / 2, (xx + yy) / 2
+    off = np.hypot(half, xy)
+    power = np.stack([mean + off, np.maximum(mean - off, 0)], -1)
+    angle = 0.5 * np.arctan2(xy, half)
+    normal = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
+    return texture, power, normal
+
+
+def trust(apart: Array, normal: Array, options: FlowOptions) -> tuple[Array, Array]:
+    """How far both ways agree, in [0,1], across the strongest edge and along it, [h,w] each.
+
+    A match may slip along an edge and still be right across it, as long as it does not slip so
+    far that it has left the edge.
+
+    Args:
+        apart: [h,w,2] where the way there and back ends, seen from its start, pixels.
+        normal: [h,w,2] of `FlowFrame`.
+    """
+    across = apart[..., 0] * normal[..., 0] + apart[..., 1] * normal[..., 1]
+    error2 = (apart**2).sum(axis=-1)
+    first = 1.0 / (1.0 + across**2 / options.consistency**2)
+    first[(np.abs(across) > options.cutoff) | (error2 > options.slide**2)] = 0.0
+    second = 1.0 / (1.0 + error2 / options.consistency**2)
+    second[error2 > options.cutoff**2] = 0.0
+    return first.astype(np.float32), second.astype(np.float32)
+
+
+def information(frame: FlowFrame, across: Array, along: Array, texture: float) -> Array:
+    """Information (xx, yy, xy) of matches from a frame, [h,w,3] float32.
+
+    Along each eigenvector of the structure tensor its eigenvalue says how much of the trust counts:
+    power / (power + texture^2).
+
+    Args:
+        across, along: [h,w] in [0,1], trust along the first and the second eigenvector.
+        texture: grey levels per pixel; 0: the picture is not asked.
+    """
+    first, second = across, along
+    if texture > 0:
+        level = np.float32(texture**2)
+        first = across * frame.power[..., 0] / (frame.power[..., 0] + level)
+        second = along * frame.power[..., 1] / (frame.power[..., 1] + level)
+    x, y = frame.normal[..., 0], frame.normal[..., 1]
+    matrix = np.stack(
+        [first * x * x + second * y * y, first * y * y + second * x * x, (first - second) * x * y],
+        -1,
+    )
+    whole: Array = matrix.astype(np.float32)
+    return whole

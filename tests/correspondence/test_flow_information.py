@@ -1,0 +1,174 @@
+"""What `flow` says of matches on lines: sure across, silent along."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.geometry.camera import Grid
+from droidw.interfaces.correspondence import EdgeRequest
+from droidw.plugin.component import BuildContext
+from droidw.slam.frame import Frame
+from droidw_plugins.correspondence import flow
+from droidw_plugins.correspondence._flow_information import information, structure, trust
+from droidw_plugins.correspondence._flow_types import FlowFrame
+
+HEIGHT, WIDTH, STRIDE = 160, 208, 8
+GRID = Grid.of(HEIGHT, WIDTH, STRIDE, (STRIDE - 1) / 2)
+INNER = (slice(4, -4), slice(4, -4))
+ANGLES = (0.0, 30.0, 45.0, 90.0, 120.0, 165.0)
+
+
+def stripes(degrees, shift=(0.0, 0.0), periods=(23.0, 37.0, 71.0)):
+    """Grey levels [H,W] of stripes whose normal has this angle against x, moved by `shift`."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    n = np.deg2rad(degrees)
+    across = (x - shift[0]) * np.cos(n) + (y - shift[1]) * np.sin(n)
+    waves = [35 * np.sin(2 * np.pi * across / p + p) for p in periods]
+    return (128 + np.sum(waves, axis=0)).astype(np.float32)
+
+
+def blobs(shift=(0.0, 0.0)):
+    """Grey levels [H,W] that fix a match in every direction."""
+    crossed = ((20, (21, 90)), (75, (26, 70)), (140, (31, 60)))
+    return 128 + sum(stripes(degrees, shift, periods) - 128 for degrees, periods in crossed) / 2
+
+
+def frame(index, grey):
+    image = torch.from_numpy(grey / 255).expand(3, -1, -1).contiguous()
+    return Frame(index, index / 10, image, torch.tensor([200.0, 200.0, 104.0, 80.0]), str(index))
+
+
+def operator(**options):
+    made = flow.COMPONENT.options(workers=1, **options)
+    return flow.COMPONENT.factory(made, BuildContext(device=torch.device("cpu")))
+
+
+def measured(first, second, purpose="window", **options):
+    part = operator(**options)
+    payload = [part.encode(frame(n, grey), GRID) for n, grey in enumerate((first, second))]
+    y, x = torch.meshgrid(
+        torch.arange(float(GRID.height)), torch.arange(float(GRID.width)), indexing="ij"
+    )
+    coords = torch.stack([x, y], dim=-1)[None]
+    valid = torch.ones(coords.shape[:3], dtype=torch.bool)
+    request = EdgeRequest([0], [0], [1], coords, valid, payload.__getitem__, informed=False)
+    answer = part.session(purpose).update(request)
+    return answer.target[0] - coords[0], answer.confidence[0].double()
+
+
+def along(confidence, degrees):
+    """n^T W n, [h,w], for a direction."""
+    x, y = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    xx, yy, xy = confidence.unbind(-1)
+    return xx * x * x + yy * y * y + 2 * xy * x * y
+
+
+def is_information(confidence):
+    xx, yy, xy = confidence.unbind(-1)
+    return bool((xx >= 0).all() and (yy >= 0).all() and (xy**2 <= xx * yy + 1e-6).all())
+
+
+@pytest.mark.parametrize("purpose", ["window", "fill"])
+@pytest.mark.parametrize("degrees", ANGLES)
+def test_a_line_is_known_across_and_not_along(degrees, purpose):
+    n = np.deg2rad(degrees)
+    moved = 2 * np.array([np.cos(n), np.sin(n)]) + 1.5 * np.array([-np.sin(n), np.cos(n)])
+    # lines without a mark and without an end: nothing keeps a match from slipping far
+    apart, confidence = measured(stripes(degrees), stripes(degrees, moved), purpose, slide=100.0)
+    assert confidence.shape == (GRID.height, GRID.width, 3)
+    assert is_information(confidence)
+    across, silent = along(confidence, degrees)[INNER], along(confidence, degrees + 90)[INNER]
+    assert float(across.median()) > 0.7
+    assert float(silent.max()) < 0.01
+    # what is said across is true, whatever the match does along the line
+    step = apart[..., 0] * np.cos(n) + apart[..., 1] * np.sin(n)
+    assert float((step[INNER] * STRIDE - 2).abs().median()) < 0.5
+
+
+def test_the_two_weights_alone_would_call_a_slanted_line_known_along_it():
+    _, confidence = measured(stripes(45), stripes(45, (2.0, 2.0)))
+    two = torch.cat([confidence[..., :2], torch.zeros_like(confidence[..., :1])], dim=-1)
+    assert float(along(two, 135)[INNER].median()) > 0.3
+    assert float(along(confidence, 135)[INNER].median()) < 0.02
+
+
+def test_a_picture_of_blobs_is_known_in_every_direction():
+    _, confidence = measured(blobs(), blobs((2.0, 1.0)))
+    assert is_information(confidence)
+    for degrees in ANGLES:
+        assert float(along(confidence, degrees)[INNER].median()) > 0.6
+
+
+def test_a_blank_picture_says_nothing():
+    blank = np.full((HEIGHT, WIDTH), 90.0, dtype=np.float32)
+    for purpose in ("window", "fill"):
+        _, confidence = measured(blank, blank, purpose)
+        assert float(confidence.abs().max()) < 1e-6
+
+
+def test_without_texture_the_agreement_alone_counts():
+    blank = np.full((HEIGHT, WIDTH), 90.0, dtype=np.float32)
+    _, confidence = measured(blank, blank, texture=0.0)
+    assert torch.equal(confidence[INNER], torch.tensor([1.0, 1.0, 0.0]).expand(12, 18, 3).double())
+
+
+@pytest.mark.parametrize("degrees", ANGLES)
+def test_the_normal_is_the_direction_of_the_gradient(degrees):
+    centres = GRID.centres().numpy().astype(np.float32)
+    texture, power, normal = structure(stripes(degrees), centres, STRIDE)
+    n = np.deg2rad(degrees)
+    sine = normal[..., 0] * np.sin(n) - normal[..., 1] * np.cos(n)
+    assert np.abs(sine[INNER]).max() < 0.02
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1.0, rtol=1e-6)
+    assert (power[..., 0] >= power[..., 1]).all() and (power[..., 1] >= 0).all()
+    assert (power[INNER][..., 1] < 0.01 * power[INNER][..., 0]).all()
+    # the root of sum((35 2 pi / period)^2) / 2
+    assert np.sqrt(power[INNER][..., 0].mean()) == pytest.approx(8.3, rel=0.1)
+    assert texture.dtype == power.dtype == normal.dtype == np.float32
+
+
+def test_a_match_may_slip_along_an_edge_but_not_off_it():
+    options = flow.COMPONENT.options()
+    normal = np.array([0.6, 0.8], dtype=np.float32)
+    tangent = np.array([-0.8, 0.6], dtype=np.float32)
+    errors = {"none": (0, 0), "slip": (0, 5), "off": (0, 7), "across": (0.5, 0), "far": (3.5, 0)}
+    apart = np.stack([across * normal + slip * tangent for across, slip in errors.values()])
+    first, second = trust(apart, np.tile(normal, (len(errors), 1)), options)
+    half = 0.5
+    assert dict(zip(errors, first, strict=True)) == pytest.approx(
+        {"none": 1, "slip": 1, "off": 0, "across": half, "far": 0}, abs=1e-5
+    )
+    assert dict(zip(errors, second, strict=True)) == pytest.approx(
+        {"none": 1, "slip": 0, "off": 0, "across": half, "far": 0}, abs=1e-5
+    )
+
+
+def test_information_is_the_sum_of_both_directions():
+    g = np.random.default_rng(3)
+    shape = (5, 6)
+    angle = g.uniform(0, 2 * np.pi, shape)
+    power = np.sort(g.uniform(0, 40, (*shape, 2)), axis=-1)[..., ::-1].astype(np.float32)
+    normal = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
+    blank = np.zeros(shape, np.uint8)
+    payload = FlowFrame(0, blank, power, power, normal, power, STRIDE)
+    trusted = g.uniform(0, 1, (2, *shape)).astype(np.float32)
+    found = information(payload, *trusted, texture=2.0)
+    share = trusted * np.moveaxis(power / (power + 4), -1, 0)
+    n, t = normal[..., None], np.stack([-normal[..., 1], normal[..., 0]], -1)[..., None]
+    expected = share[0][..., None, None] * n * np.swapaxes(n, -1, -2)
+    expected = expected + share[1][..., None, None] * t * np.swapaxes(t, -1, -2)
+    for k, (a, b) in enumerate(((0, 0), (1, 1), (0, 1))):
+        np.testing.assert_allclose(found[..., k], expected[..., a, b], atol=1e-6)
+    assert found.dtype == np.float32
+    assert is_information(torch.from_numpy(found).double())
+
+
+def test_no_edges_have_three_channels_too():
+    part = operator()
+    none = torch.zeros(0, GRID.height, GRID.width, 2)
+    request = EdgeRequest([], [], [], none, none[..., 0] > 0, [].__getitem__)
+    answer = part.session().update(request)
+    assert answer.target.shape == none.shape
+    assert answer.confidence.shape == (0, GRID.height, GRID.width, 3)
