@@ -39,7 +39,7 @@ CHANNELS = 64
 DRIFT = 0.002
 """Translation of all cameras between two updates, as late iterations move them (scene units)."""
 
-CPU_PRESET = {"smooth": 1, "residual_gain": 0.35}
+CPU_PRESET = {"smooth": 1, "residual_gain": 0.35, "residual_majority": 0.6}
 CASES = (
     ("affine-softplus", affine_softplus.COMPONENT, {}),
     ("  preset cpu", affine_softplus.COMPONENT, CPU_PRESET),

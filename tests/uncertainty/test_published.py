@@ -15,7 +15,7 @@ from droidw.interfaces.uncertainty import UncertaintyModel, UncertaintyView
 from droidw.plugin.component import BuildContext
 from droidw_plugins.uncertainty import _objective as objective
 from droidw_plugins.uncertainty import affine_softplus, mlp, per_pixel
-from droidw_plugins.uncertainty._published import box_mean, residual_factor
+from droidw_plugins.uncertainty._published import agreeing_majority, box_mean, residual_factor
 
 Start = Callable[..., UncertaintyView]
 MODELS = (affine_softplus, per_pixel, mlp)
@@ -50,6 +50,19 @@ def test_factor_is_below_one_where_motion_agrees() -> None:
     assert 1.09 < apart <= 1.1
     assert unmeasured == pytest.approx(1.0, abs=1e-6)
     assert broken == pytest.approx(1.0, abs=1e-6)
+
+
+def test_residuals_count_where_most_of_the_measured_motion_agrees() -> None:
+    def believed(agreeing: int, least: float = 0.6) -> float:
+        residual = torch.full((1, 1, 10), 50.0)
+        residual[..., :agreeing] = 0.0
+        return float(agreeing_majority(residual, torch.ones(1, 1, 10), 0.2, least))
+
+    assert [round(believed(n), 1) for n in (0, 6, 7, 8, 10)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    assert believed(0, least=0.0) == 1.0
+    broken = torch.tensor([[[0.0, torch.nan, 9.0]]])
+    assert agreeing_majority(broken, torch.tensor([[[1.0, 1.0, 0.0]]]), 0.2, 0.5) == 1.0
+    assert agreeing_majority(broken, torch.zeros(1, 1, 3), 0.2, 0.5) == 0.0  # nothing measured
 
 
 def _measured(view: UncertaintyView) -> UncertaintyView:

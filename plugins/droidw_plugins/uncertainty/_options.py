@@ -78,6 +78,15 @@ class ObjectiveOptions:
     residual_scale: float = field(
         default=0.2, metadata={"help": "residual in cells at which agreement is a half", "gt": 0}
     )
+    residual_majority: float = field(
+        default=0.0,
+        metadata={
+            "help": "share of the measured motion that must agree with the poses before residuals "
+            "count; they count in full from 0.2 more (0: always)",
+            "ge": 0,
+            "lt": 1,
+        },
+    )
     refresh: int = field(
         default=1,
         metadata={"help": "similarities are renewed at every n-th step on the same edges", "ge": 1},

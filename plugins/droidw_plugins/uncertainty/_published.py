@@ -11,7 +11,7 @@ from droidw.interfaces.uncertainty import StoreField, UncertaintyView
 from droidw_plugins.uncertainty import _objective as objective
 from droidw_plugins.uncertainty._options import ObjectiveOptions
 
-__all__ = ["Publisher", "box_mean", "residual_factor"]
+__all__ = ["Publisher", "agreeing_majority", "box_mean", "residual_factor"]
 
 _LEARNED = "uncertainty_learned"
 _FACTOR = "uncertainty_factor"
@@ -21,6 +21,8 @@ _PRIOR = 0.1
 """Confidence with which every cell starts out as neutral."""
 _FAR = 4.0
 """Residuals beyond so many cells count as this."""
+_RAMP = 0.2
+"""How far above the least share of agreeing motion residuals count in full."""
 
 
 def box_mean(maps: Tensor, radius: int) -> Tensor:
@@ -32,8 +34,8 @@ def box_mean(maps: Tensor, radius: int) -> Tensor:
 
 
 def residual_factor(
-    residual: Tensor, confidence: Tensor, ii: Tensor, frames: int, scale: float, gain: float,
-    smooth: int,
+    residual: Tensor, confidence: Tensor, ii: Tensor, frames: int, scale: float,
+    gain: float | Tensor, smooth: int,
 ) -> Tensor:  # fmt: skip
     """Factor [N,h,w] on the uncertainty of each cell: below one where measured motion agrees.
 
@@ -45,8 +47,7 @@ def residual_factor(
             means nothing. confidence: [E,h,w]. ii: [E] in [0, frames).
         smooth: radius over which r is averaged.
     """
-    weight = torch.where(torch.isfinite(residual) & torch.isfinite(confidence), confidence, 0.0)
-    cut = residual.nan_to_num(_FAR, _FAR, _FAR).clamp_max(_FAR)
+    weight, cut = _usable(residual, confidence)
     shape = (frames, *residual.shape[1:])
     total = weight.new_full(shape, _PRIOR).index_add_(0, ii, weight)
     # At this residual the agreement is neutral.
@@ -56,11 +57,37 @@ def residual_factor(
     return 1.0 + gain * (_NEUTRAL - agreement)
 
 
+def agreeing_majority(
+    residual: Tensor, confidence: Tensor, scale: float, least: float
+) -> float | Tensor:
+    """How far residuals may be believed, in [0,1]: by the share that agrees with the poses.
+
+    Where tracking has been lost, or follows what moves, most measured motion disagrees, and what
+    agrees is the wrong part. With a the mean of `1 / (1 + (r / scale)^2)` over all measurements,
+    weighted by confidence, the result is 0 up to a = `least` and 1 from 0.2 more.
+
+    Args:
+        residual, confidence: [E,h,w], as for `residual_factor`.
+        least: share in [0,1); 0 believes always.
+    """
+    if least == 0:
+        return 1.0
+    weight, cut = _usable(residual, confidence)
+    agreeing = (weight / (1.0 + (cut / scale).square_())).sum() / weight.sum().clamp_min(1e-6)
+    return ((agreeing - least) / _RAMP).clamp(0.0, 1.0)
+
+
+def _usable(residual: Tensor, confidence: Tensor) -> tuple[Tensor, Tensor]:
+    """Confidences with 0 where nothing is known, and bounded residuals; both [E,h,w]."""
+    weight = torch.where(torch.isfinite(residual) & torch.isfinite(confidence), confidence, 0.0)
+    return weight, residual.nan_to_num(_FAR, _FAR, _FAR).clamp_max(_FAR)
+
+
 class Publisher:
     """Writes maps to the store; what was learned stays apart where the two differ.
 
     Args:
-        options: `smooth`, `residual_gain` and `residual_scale` are read.
+        options: `smooth` and those named `residual_...` are read.
     Attributes:
         fields: none by default; else the map [h,w] as learned, and the factor of `residual_factor`
             as it was last found.
@@ -96,13 +123,17 @@ class Publisher:
         xy, valid = objective.project(view.T_cw, view.disps, view.intrinsics, view.ii, view.jj)
         shape = view.target.shape[:3]
         apart = view.target.movedim(-1, 1) - xy.view(shape[0], 2, *shape[1:])
+        residual = torch.linalg.vector_norm(apart, dim=1)
+        confidence = view.confidence[..., :2].mean(-1) * valid.view(shape)
+        scale = options.residual_scale
+        believed = agreeing_majority(residual, confidence, scale, options.residual_majority)
         factor = residual_factor(
-            torch.linalg.vector_norm(apart, dim=1),
-            view.confidence[..., :2].mean(-1) * valid.view(shape),
+            residual,
+            confidence,
             view.ii - first,
             last - first,
-            options.residual_scale,
-            options.residual_gain,
+            scale,
+            options.residual_gain * believed,
             options.smooth,
         )
         starts = on_device(sorted(set(known)), view.disps.device)
