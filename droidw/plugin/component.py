@@ -47,6 +47,8 @@ class BuildContext:
         compat: names of published behaviours asked for, such as "droid-w".
         camera: of the raw pictures, or None where it is not known (frames carry their own
             intrinsics, at working size).
+        disabled: parts switched off by `DROIDW_DISABLE_PLUGINS`, as "kind/name": a part that
+            chooses among others leaves them out.
     """
 
     device: torch.device
@@ -56,6 +58,7 @@ class BuildContext:
     run_dir: Path | None = None
     compat: frozenset[str] = frozenset()
     camera: Camera | None = None
+    disabled: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)

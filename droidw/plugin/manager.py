@@ -91,11 +91,18 @@ class Plugins:
                 (f"did you mean '{near}'?   " if near else "") + "kinds: " + ", ".join(KINDS),
             )
         entries = [e for e in self._entries if e.kind == kind]
-        blocked = {
-            e.component.name for e in entries if self._blocked & {e.component.name, _full_name(e)}
-        }
+        disabled = self.disabled()
+        blocked = {e.component.name for e in entries if _full_name(e) in disabled}
         return Registry(
             KINDS[kind], entries, frozenset(blocked), tuple(self.failures), self.weights_dir
+        )
+
+    def disabled(self) -> frozenset[str]:
+        """Full names, "kind/name", of the parts that are loaded and switched off."""
+        return frozenset(
+            _full_name(e)
+            for e in self._entries
+            if self._blocked & {e.component.name, _full_name(e)}
         )
 
     def entries(self) -> list[Entry]:

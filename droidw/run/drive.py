@@ -112,6 +112,7 @@ class _Run:
             data_dir=plugins.data_dir,
             run_dir=run_dir,
             compat=frozenset(self.config.compat),
+            disabled=plugins.disabled(),
         )
         _seed(self.config.seed, self.config.threads)
         self.events = Dispatcher(

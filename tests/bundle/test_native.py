@@ -11,6 +11,7 @@ import torch
 
 from droidw.errors import MissingRequirementError
 from droidw.plugin.component import BuildContext
+from droidw.plugin.manager import load_plugins
 from droidw_plugins.bundle import _build, auto_ba, native_ba
 from droidw_plugins.bundle._native_calls import native_recipe
 
@@ -127,6 +128,15 @@ def test_auto_goes_on_with_torch_where_nothing_compiles(make, broken_compiler, c
     assert "kaput: line 7" in caplog.text
     p, _, _ = make(noise=0.02)
     assert built.step(p).report.status == "ok"
+
+
+def test_auto_leaves_out_what_is_switched_off(compiler):
+    disabled = load_plugins(environ={"DROIDW_DISABLE_PLUGINS": "ba/native"}).disabled()
+    assert disabled == {"ba/native"}
+    context = BuildContext(device=torch.device("cpu"), disabled=disabled)
+    built = auto_ba.COMPONENT.factory(auto_ba.AutoBundleOptions(), context)
+    assert built.chosen == "torch"
+    assert "DROIDW_DISABLE_PLUGINS" in built.reason
 
 
 def test_auto_goes_on_with_torch_where_kernels_compile_but_do_not_run(compiler, monkeypatch):

@@ -51,6 +51,8 @@ def _build(options: AutoBundleOptions, context: BuildContext) -> BundleAdjuster:
     backend: BundleAdjuster
     chosen, kind = ("cuda", "GPU") if context.device.type == "cuda" else ("native", "processor")
     try:
+        if f"ba/{chosen}" in context.disabled:
+            raise MissingRequirementError(f"'{chosen}' is switched off by DROIDW_DISABLE_PLUGINS")
         if chosen == "cuda":
             made = cuda_ba.CudaBundleOptions(halvings=options.halvings)
             backend = cuda_ba.COMPONENT.factory(made, context)
