@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from droidw.errors import InputError
 from droidw.eval.associate import DEFAULT_MAX_DIFF, associate
+from droidw.io.masks import numbers_in_names, seconds_in_names
 
 __all__ = [
     "check_shape",
@@ -59,7 +60,7 @@ def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
         return named
     if len(frames) == len(files):
         return dict(enumerate(files))
-    numbers = {int(path.stem): path for path in files if path.stem.isdecimal()}
+    numbers = numbers_in_names(files)
     if len(numbers) == len(files):
         gaps = max(numbers) - min(numbers) + 1 > len(numbers)
         if max(numbers) < len(frames) or (gaps and not frames):
@@ -75,14 +76,11 @@ def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
 
 def _by_time(files: Sequence[Path], times: Sequence[float]) -> dict[int, Path]:
     """Masks whose names are seconds, by the index of the nearest frame; empty if they are not."""
-    try:
-        stems = [float(path.stem) if "." in path.stem else math.nan for path in files]
-    except ValueError:
-        return {}
-    if not times or not np.isfinite(stems).all() or not np.isfinite(times).all():
+    named = seconds_in_names(files)
+    if named is None or not times or not np.isfinite(times).all():
         return {}
     try:
-        found = associate(np.array(stems), np.array(times), DEFAULT_MAX_DIFF)
+        found = associate(named, np.array(times), DEFAULT_MAX_DIFF)
     except InputError:
         return {}
     return {int(ref): files[int(est)] for est, ref in zip(found.est, found.ref, strict=True)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from droidw.errors import InputError
 from droidw.slam.frame import RawFrame
 
-__all__ = ["UserMasks"]
+__all__ = ["UserMasks", "numbers_in_names", "seconds_in_names"]
 
 _LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
 _LOSSY = (".jpg", ".jpeg")
@@ -52,7 +53,9 @@ class UserMasks:
         self._files = sorted(files)
         self._by_name = {path.stem: path for path in self._files}
         self._times: npt.NDArray[np.float64] | None = None
-        self._by_index: dict[int, Path] | None = _numbers(files) if _written_by_us(folder) else None
+        self._by_index: dict[int, Path] | None = (
+            numbers_in_names(files) if _written_by_us(folder) else None
+        )
         self._settled = self._by_index is not None
 
     def of(self, frame: RawFrame) -> npt.NDArray[np.bool_] | None:
@@ -101,7 +104,7 @@ class UserMasks:
         stem = Path(first.name).stem
         if stem in self._by_name:
             return
-        self._times = _seconds(self._files)
+        self._times = seconds_in_names(self._files)
         if self._times is not None:
             if self._near(first.time, int(np.abs(self._times - first.time).argmin())):
                 return
@@ -110,7 +113,7 @@ class UserMasks:
         if least and least <= count and (most is None or count <= most):
             self._by_index = dict(enumerate(self._files))
             return
-        numbers = _numbers(self._files)
+        numbers = numbers_in_names(self._files)
         if len(numbers) == count and (most is None or max(numbers) < most):
             self._by_index = numbers
             return
@@ -123,11 +126,12 @@ class UserMasks:
         )
 
 
-def _numbers(files: list[Path]) -> dict[int, Path]:
+def numbers_in_names(files: Sequence[Path]) -> dict[int, Path]:
+    """The files whose names are numbers alone, by that number."""
     return {int(path.stem): path for path in files if path.stem.isdecimal()}
 
 
-def _seconds(files: list[Path]) -> npt.NDArray[np.float64] | None:
+def seconds_in_names(files: Sequence[Path]) -> npt.NDArray[np.float64] | None:
     """The times that the names are, or None if they are not all fractions of seconds."""
     try:
         times = np.array([float(path.stem) for path in files if "." in path.stem])
