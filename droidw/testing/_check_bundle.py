@@ -55,16 +55,20 @@ def bundle_adjuster(subject: Subject) -> None:
     )
     subject.expect(
         "edge-order",
-        bool(
-            torch.allclose(turned.T_cw, step.T_cw, atol=2e-4)
-            and torch.allclose(turned.disps, step.disps, atol=2e-3)
-        ),
+        _alike(turned, step),
         "the order of the edges changes the step",
     )
     _options_of_the_problem(subject, part, problem)
     _bad_numbers(subject, part, problem)
     _convergence(subject, part, problem)
     _information(subject, part, problem, step)
+
+
+def _alike(one: Step, other: Step) -> bool:
+    """Whether two ways of summing may have led to these."""
+    return torch.allclose(one.T_cw, other.T_cw, atol=2e-4) and torch.allclose(
+        one.disps, other.disps, atol=2e-3
+    )
 
 
 def _options_of_the_problem(subject: Subject, part: Any, problem: BAProblem) -> None:
@@ -126,10 +130,7 @@ def _information(subject: Subject, part: Any, problem: BAProblem, plain: Step) -
     step = _step(subject, part, none, "an off-diagonal of zeros")
     subject.expect(
         "information",
-        bool(
-            torch.allclose(step.T_cw, plain.T_cw, atol=2e-4)
-            and torch.allclose(step.disps, plain.disps, atol=2e-3)
-        ),
+        _alike(step, plain),
         "an off-diagonal of zeros changes the step",
     )
     step = _step(subject, part, tilted, "a full information")
