@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Optimiser", "Parts"]
 
-Edges = Sequence[tuple[int, int]]
+Pairs = Sequence[tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -151,9 +151,9 @@ class Optimiser:
             return
         ii, jj = graph.index(rows)
         at = on_device(rows, graph.target.device)
-        edges = [(graph.ii[r], graph.jj[r]) for r in rows]
-        low = min(min(edge) for edge in edges)
-        used = _Edges(low, ii - low, jj - low, [(i - low, j - low) for i, j in edges])
+        pairs = [(graph.ii[r], graph.jj[r]) for r in rows]
+        low = min(min(pair) for pair in pairs)
+        used = _Edges(low, ii - low, jj - low, [(i - low, j - low) for i, j in pairs])
         everything = len(rows) == len(graph)
         target = graph.target if everything else graph.target[at]
         confidence = graph.confidence if everything else graph.confidence[at]
@@ -162,7 +162,7 @@ class Optimiser:
                 self._step(used, target, confidence, phase, solver, first_free)
             if phase.learn:
                 with self.clock("uncertainty"):
-                    self._learn(ii, jj, edges, target, confidence, first_free)
+                    self._learn(ii, jj, pairs, target, confidence, first_free)
 
     def _step(
         self,
@@ -239,13 +239,13 @@ class Optimiser:
         target: Tensor | None = None,
         confidence: Tensor | None = None,
         frames: Sequence[int] = (),
-        edges: Edges = (),
+        pairs: Pairs = (),
     ) -> UncertaintyView:
-        """What the uncertainty model sees of the store and of these edges, `edges` on the host."""
+        """What the uncertainty model sees of the store and of these edges, `pairs` on the host."""
         store = self.store
         host = None
-        if ii is None or edges:
-            host = Indices([i for i, _ in edges], [j for _, j in edges], list(frames))
+        if ii is None or pairs:
+            host = Indices([i for i, _ in pairs], [j for _, j in pairs], list(frames))
         none = torch.zeros(0, dtype=torch.int64, device=store.device)
         blank = store.disps.new_zeros(0, store.grid.height, store.grid.width, 2)
         return UncertaintyView(
@@ -269,13 +269,13 @@ class Optimiser:
         self,
         ii: Tensor,
         jj: Tensor,
-        edges: Edges,
+        pairs: Pairs,
         target: Tensor,
         confidence: Tensor,
         first_free: int,
     ) -> None:
-        frames = sorted({i for i, _ in edges} | set(range(first_free, len(self.store))))
-        report = self.parts.uncertainty.update(self.view(ii, jj, target, confidence, frames, edges))
+        frames = sorted({i for i, _ in pairs} | set(range(first_free, len(self.store))))
+        report = self.parts.uncertainty.update(self.view(ii, jj, target, confidence, frames, pairs))
         self.iterations += 1
         if not math.isfinite(report.energy):
             self.reports["uncertainty"] = self.reports.get("uncertainty", 0) + 1
