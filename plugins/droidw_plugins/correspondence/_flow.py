@@ -20,6 +20,7 @@ from droidw_plugins.correspondence._flow_information import (
     structure,
     trust,
 )
+from droidw_plugins.correspondence._flow_mask import without
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Track
 
@@ -58,12 +59,15 @@ class FlowCorrespondence:
         self._pairs: OrderedDict[tuple[int, int, bool], tuple[Edge, Edge]] = OrderedDict()
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
-        """Grey image and its structure at the cells."""
+        """Grey image, less what the user's mask covers, and its structure at the cells."""
         rgb = cv2.merge(list(frame.image.cpu().numpy()))
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         centres = grid.centres().numpy().astype(np.float32)
         scaled = grey * np.float32(255.0)
         grey8 = np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
+        if frame.mask is not None:
+            grey8 = without(grey8, frame.mask.cpu().numpy())
+            scaled = grey8.astype(np.float32)
         seen = structure(scaled, centres, self.stride)
         return FlowFrame(frame.index, grey8, *seen, centres, self.stride)
 

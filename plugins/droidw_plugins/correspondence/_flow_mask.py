@@ -1,0 +1,47 @@
+"""Pictures without what the user's mask covers, so that a search does not follow it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["without"]
+
+Picture = npt.NDArray[np.uint8]
+
+# Pixels around a mask that go with it: contours are blurred, by compression and by resizing.
+_MARGIN = 2
+# Smallest side of the coarsest level, and the share of known pixels that counts as some.
+_COARSEST = 2
+_SOME = 1e-3
+
+
+def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
+    """The picture with a smooth bridge over what the mask covers; the rest stays as it is.
+
+    Pyramids of the picture and of what is known of it are averaged downwards, and gaps filled
+    from the next coarser level on the way up (pull and push: Gortler et al., The Lumigraph, 1996,
+    section 3.4). The bridge has no edges of its own that could be matched.
+
+    Args:
+        grey: [H,W] uint8.
+        mask: [H,W], True where the picture is to be ignored.
+    """
+    size = 2 * _MARGIN + 1
+    covered: Any = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
+    if not covered.any():
+        return grey
+    known: Any = 1.0 - covered.astype(np.float32)
+    sums, shares = [grey * known], [known]
+    while min(sums[-1].shape) > _COARSEST:
+        sums.append(cv2.pyrDown(sums[-1]))
+        shares.append(cv2.pyrDown(shares[-1]))
+    bridge: Any = sums[-1] / np.maximum(shares[-1], _SOME)
+    for level, share in zip(sums[-2::-1], shares[-2::-1], strict=True):
+        above = cv2.pyrUp(bridge, dstsize=(level.shape[1], level.shape[0]))
+        bridge = level + above * (1.0 - share)
+    filled = np.clip(bridge + 0.5, 0, 255).astype(np.uint8)
+    return np.where(covered > 0, filled, grey)

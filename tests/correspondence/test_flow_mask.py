@@ -1,0 +1,119 @@
+"""What the user's mask covers is no part of the picture for `flow`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.geometry.camera import Grid
+from droidw.interfaces.correspondence import EdgeRequest
+from droidw.plugin.component import BuildContext
+from droidw.slam.frame import Frame
+from droidw_plugins.correspondence import flow
+from droidw_plugins.correspondence._flow_mask import without
+
+HEIGHT, WIDTH = 160, 208
+GRID = Grid.of(HEIGHT, WIDTH, 8, 3.5)
+
+
+def hole(top=48, left=64, height=64, width=80):
+    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    mask[top : top + height, left : left + width] = True
+    return mask
+
+
+def grain(seed, coarse=4):
+    """[H,W] grey levels of smooth noise."""
+    rng = np.random.default_rng(seed)
+    cells = torch.from_numpy(rng.random((1, 1, HEIGHT // coarse, WIDTH // coarse)))
+    full = torch.nn.functional.interpolate(cells, (HEIGHT, WIDTH), mode="bicubic")[0, 0]
+    return (255 * full.clamp(0, 1)).numpy()
+
+
+def test_a_ramp_is_bridged_and_the_rest_stays():
+    ramp = np.broadcast_to(np.linspace(20, 220, WIDTH), (HEIGHT, WIDTH)).round().astype(np.uint8)
+    mask = hole()
+    seen = np.where(mask, 255, ramp).astype(np.uint8)
+    seen[mask] = np.random.default_rng(0).integers(0, 256, mask.sum())
+    bridged = without(seen, mask)
+    far = ~hole(44, 60, 72, 88)
+    assert np.array_equal(bridged[far], seen[far])
+    apart = bridged[mask].astype(float) - ramp[mask]
+    assert np.abs(apart).max() < 45  # the ramp spans 77 levels inside the mask, the noise 255
+    steps = np.abs(np.diff(bridged.astype(float), axis=1))
+    assert steps[mask[:, 1:]].max() < 12  # no edge to match: the noise steps by up to 255
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_masks_of_nothing_and_of_all(share):
+    grey = grain(1).astype(np.uint8)
+    bridged = without(grey, np.full(grey.shape, share > 0))
+    assert bridged.dtype == np.uint8
+    if share:
+        assert np.ptp(bridged.astype(int)) == 0
+    else:
+        assert np.array_equal(bridged, grey)
+
+
+def frame(index, grey, mask=None):
+    image = torch.from_numpy(grey / 255).float().expand(3, -1, -1).contiguous()
+    camera = torch.tensor([200.0, 200.0, 104.0, 80.0])
+    known = None if mask is None else torch.from_numpy(mask)
+    return Frame(index, index / 10, image, camera, str(index), known)
+
+
+def pair(shift, other, contrast=1.0):
+    """Two frames of a picture that moves by `shift` px, with a patch that moves by `other` px."""
+    scene, patch = 128 + contrast * (grain(2) - 128), grain(3)
+    masks = [hole(), hole(left=64 + other)]
+    pictures = [scene, np.roll(scene, shift, axis=1)]
+    patches = [patch, np.roll(patch, other, axis=1)]
+    made = [np.where(m, p, s) for m, p, s in zip(masks, patches, pictures, strict=True)]
+    return [frame(n, grey, m) for n, (grey, m) in enumerate(zip(made, masks, strict=True))]
+
+
+def measured(frames):
+    """Displacement [h,w,2] px and confidence [h,w,3] from the first to the second."""
+    options = flow.COMPONENT.options(workers=1)
+    part = flow.COMPONENT.factory(options, BuildContext(device=torch.device("cpu")))
+    payload = [part.encode(f, GRID) for f in frames]
+    y, x = torch.meshgrid(
+        torch.arange(float(GRID.height)), torch.arange(float(GRID.width)), indexing="ij"
+    )
+    coords = torch.stack([x, y], dim=-1)[None]
+    valid = torch.ones(coords.shape[:3], dtype=torch.bool)
+    request = EdgeRequest([0], [0], [1], coords, valid, payload.__getitem__, informed=False)
+    answer = part.session("window").update(request)
+    return 8 * (answer.target[0] - coords[0]), answer.confidence[0]
+
+
+def test_what_is_masked_does_not_pull_at_its_surroundings():
+    frames = pair(shift=-6, other=10, contrast=0.1)
+    ring = torch.zeros(GRID.height, GRID.width, dtype=torch.bool)
+    ring[4:16, 5:21] = True
+    ring[6:14, 8:20] = False  # where the patch is in either frame
+    wrong = []
+    for given in (frames, [replace(f, mask=None) for f in frames]):
+        moved, confidence = measured(given)
+        off = (moved - torch.tensor([-6.0, 0.0])).norm(dim=-1)
+        trusted = confidence[..., :2].mean(-1)
+        wrong.append(float((trusted * (off > 2))[ring].sum() / trusted[ring].sum()))
+        if given is frames:
+            inside = confidence[8:12, 10:16]  # covered in both
+            assert float(inside[..., :2].max()) < 0.5 * float(confidence[2:4, 2:].max())
+    assert wrong[0] < 0.5 * wrong[1]
+    assert wrong[0] < 0.05
+
+
+def test_motion_is_that_of_what_is_left():
+    frames = pair(shift=0, other=12)
+    options = flow.COMPONENT.options(workers=1)
+
+    def motion(given):
+        part = flow.COMPONENT.factory(options, BuildContext(device=torch.device("cpu")))
+        return part.motion(*(part.encode(f, GRID) for f in given)).flow
+
+    assert motion(frames) < 0.3 * motion([replace(f, mask=None) for f in frames])
