@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
@@ -44,6 +44,8 @@ class EdgeRequest:
         valid: [E,h,w] bool, whether `coords` means anything (in front of the camera).
         payload: node number -> what `encode`/`context` returned for that frame.
         informed: whether poses and depths are good enough to search around `coords`.
+        gates: node numbers -> [n,h,w] in [0,1], what learned uncertainty leaves of their cells;
+            None where it is not known or not to be used.
     """
 
     ids: list[int]
@@ -53,6 +55,7 @@ class EdgeRequest:
     valid: Tensor
     payload: Callable[[int], Any]
     informed: bool = True
+    gates: Callable[[Sequence[int]], Tensor] | None = None
 
 
 @dataclass(frozen=True)

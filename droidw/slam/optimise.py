@@ -87,9 +87,18 @@ class Optimiser:
         self.cost = float("nan")
 
     def measure(
-        self, graph: FactorGraph, session: EdgeSession, rows: list[int], informed: bool
+        self,
+        graph: FactorGraph,
+        session: EdgeSession,
+        rows: list[int],
+        informed: bool,
+        learned: bool,
     ) -> None:
-        """Ask correspondence about these edges and keep its answer in the graph."""
+        """Ask correspondence about these edges and keep its answer in the graph.
+
+        Args:
+            informed, learned: poses and depths, and uncertainty, are good enough to search with.
+        """
         if not rows:
             return
         store = self.store
@@ -104,6 +113,7 @@ class Optimiser:
             valid=valid,
             payload=store.payload,
             informed=informed,
+            gates=self.learned_gates if learned and informed else None,
         )
         with self.clock("correspondence"):
             answer = session.update(request)
@@ -132,7 +142,7 @@ class Optimiser:
             informed: whether correspondence may search around what geometry predicts.
         """
         active = graph.select()
-        self.measure(graph, session, active, informed)
+        self.measure(graph, session, active, informed, learned=phase.weigh)
         low = max(0, first_free - reach)
         retired = [r for r in graph.select(active=False) if min(graph.ii[r], graph.jj[r]) >= low]
         self.adjust(graph, sorted(active + retired), phase, solver, first_free)
@@ -226,11 +236,18 @@ class Optimiser:
 
         What the user's masks leave, times what uncertainty leaves (if `learned`).
         """
-        w, unmasked = self.weighting, self.store["unmasked"][first:]
+        unmasked = self.store["unmasked"][first:]
         if not learned:
             return unmasked
-        u = self.store["uncertainty"][first:]
-        return unmasked * gate(u, kind=w.gate, slope=w.slope, shift=w.shift, floor=w.floor)
+        return unmasked * self._gate(self.store["uncertainty"][first:])
+
+    def learned_gates(self, nodes: Sequence[int]) -> Tensor:
+        """What uncertainty alone leaves of these keyframes, [n,h,w] in [0,1]."""
+        return self._gate(self.store["uncertainty"][on_device(nodes, self.store.device)])
+
+    def _gate(self, u: Tensor) -> Tensor:
+        w = self.weighting
+        return gate(u, kind=w.gate, slope=w.slope, shift=w.shift, floor=w.floor)
 
     def view(
         self,

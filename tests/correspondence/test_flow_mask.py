@@ -117,3 +117,57 @@ def test_motion_is_that_of_what_is_left():
         return part.motion(*(part.encode(f, GRID) for f in given)).flow
 
     assert motion(frames) < 0.3 * motion([replace(f, mask=None) for f in frames])
+
+
+def gated(frames, gates, **options):
+    """As `measured`, with gates [2,h,w] of uncertainty; blind first, then informed."""
+    part = flow.COMPONENT.factory(
+        flow.COMPONENT.options(workers=1, **options), BuildContext(device=torch.device("cpu"))
+    )
+    payload = [part.encode(f, GRID) for f in frames]
+    y, x = torch.meshgrid(
+        torch.arange(float(GRID.height)), torch.arange(float(GRID.width)), indexing="ij"
+    )
+    coords = torch.stack([x, y], dim=-1)[None]
+    valid = torch.zeros(coords.shape[:3], dtype=torch.bool)
+    blind = EdgeRequest([0], [0], [1], coords, valid, payload.__getitem__, informed=False)
+    knowing = replace(blind, informed=True, gates=lambda nodes: gates[list(nodes)])
+    session = part.session("window")
+    answers = [session.update(request) for request in (blind, knowing)]
+    return [(8 * (a.target[0] - coords[0]), a.confidence[0]) for a in answers]
+
+
+def closed():
+    """Gates [2,h,w] that shut the cells of the patch of `pair(-6, 10)` in either frame."""
+    gates = torch.ones(2, GRID.height, GRID.width)
+    gates[0, 6:14, 8:18] = 0.1
+    gates[1, 6:14, 9:20] = 0.1
+    return gates
+
+
+def test_what_uncertainty_rejects_does_not_pull_at_its_surroundings():
+    frames = [replace(f, mask=None) for f in pair(shift=-6, other=10, contrast=0.1)]
+    (before, sure_before), (after, sure_after) = gated(frames, closed())
+    truth = torch.tensor([-6.0, 0.0])
+    right = [
+        float((c[..., :2].mean(-1) * ((m - truth).norm(dim=-1) < 1)).sum())
+        for m, c in ((before, sure_before), (after, sure_after))
+    ]
+    assert right[1] > 1.1 * right[0]
+    assert bool((sure_after[..., :2].sum(-1) >= sure_before[..., :2].sum(-1) - 1e-6).all())
+    patch = (slice(8, 12), slice(10, 16))  # what moves is still measured as it moves
+    assert torch.equal(after[patch], before[patch])
+    assert float((after[patch] - torch.tensor([10.0, 0.0])).norm(dim=-1).median()) < 0.5
+
+
+def test_open_gates_and_no_bridge_change_nothing():
+    frames = [replace(f, mask=None) for f in pair(shift=-6, other=10, contrast=0.1)]
+    plain = measured(frames)
+    for gates, options in (
+        (torch.ones(2, GRID.height, GRID.width), {}),
+        (closed(), {"bridge": 0.0}),
+    ):
+        after = gated(frames, gates, **options)[1]
+        assert torch.equal(after[0], plain[0])
+        assert torch.equal(after[1], plain[1])
+

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,7 @@ from droidw_plugins.correspondence._flow_information import (
     structure,
     trust,
 )
-from droidw_plugins.correspondence._flow_mask import without
+from droidw_plugins.correspondence._flow_mask import bridge, surer, without
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Track
 
@@ -56,7 +56,7 @@ class FlowCorrespondence:
         self._lock = threading.Lock()
         self._full: OrderedDict[tuple[int, int], Array] = OrderedDict()
         self._grid: OrderedDict[tuple[int, int], tuple[Array, Array]] = OrderedDict()
-        self._pairs: OrderedDict[tuple[int, int, bool], tuple[Edge, Edge]] = OrderedDict()
+        self._pairs: OrderedDict[tuple[Hashable, ...], tuple[Edge, Edge]] = OrderedDict()
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
         """Grey image, less what the user's mask covers, and its structure at the cells."""
@@ -193,12 +193,21 @@ class FlowCorrespondence:
         start_ab: Array | None,
         start_ba: Array | None,
         fine: bool = False,
+        bridged: tuple[FlowFrame, FlowFrame] | None = None,
     ) -> tuple[Edge, Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
         What an earlier session found from about the same start is as good as a new search.
+
+        Args:
+            a, b: frames. start_ab, start_ba: targets [h,w,2] to start from; None: free.
+            fine: at the scale of global adjustment.
+            bridged: the frames without what moves; what a second search finds between these is
+                taken where it is surer.
         """
-        key = (a.index, b.index, fine)
+        if bridged is not None and bridged[0] is a and bridged[1] is b:
+            bridged = None
+        key = (a.index, b.index, fine, *(_bits(f) for f in bridged or ()))
         with self._lock:
             known = self._pairs.get(key)
         if known is not None and all(
@@ -206,20 +215,28 @@ class FlowCorrespondence:
             for edge, start in zip(known, (start_ab, start_ba), strict=True)
         ):
             return replace(known[0]), replace(known[1])
-        if start_ab is None:
-            ab = self.free(a, b)
-        else:
-            ab = self._search(a, b, self._dense(start_ab, a), fine)
-        if start_ba is None:
-            ba = self.free(b, a)
-        else:
-            ba = self._search(b, a, self._dense(start_ba, b), fine)
+        ab, ba = self._started(a, b, start_ab, fine), self._started(b, a, start_ba, fine)
         both = self._checked(a, ab, ba, start_ab), self._checked(b, ba, ab, start_ba)
+        if bridged is not None:
+            c, d = bridged
+            ab, ba = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
+            both = (
+                surer(both[0], self._checked(a, ab, ba, start_ab), c.bridged),
+                surer(both[1], self._checked(b, ba, ab, start_ba), d.bridged),
+            )
         with self._lock:
             self._pairs[key] = both
             while len(self._pairs) > _PAIRS:
                 self._pairs.popitem(last=False)
         return replace(both[0]), replace(both[1])
+
+    def _started(self, a: FlowFrame, b: FlowFrame, start: Array | None, fine: bool) -> Array:
+        """Dense flow a -> b from these targets; without, as the motion filter searches."""
+        if start is not None:
+            return self._search(a, b, self._dense(start, a), fine)
+        if a.bridged is None and b.bridged is None:
+            return self.free(a, b)
+        return self._search(a, b, None, fine)
 
     def _dense(self, target: Array, a: FlowFrame) -> Array:
         """Grid targets [h,w,2] in cells as a full flow field [H,W,2] in pixels."""
@@ -253,11 +270,20 @@ class FlowCorrespondence:
         target = ((there - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, started)
 
+    def bridging(self, frame: FlowFrame, gate: Array) -> Callable[[], FlowFrame]:
+        """A job that makes the frame without what uncertainty rejects."""
+        return lambda: bridge(frame, gate, self.options.bridge)
+
     def map(self, jobs: list[Callable[[], Any]]) -> list[Any]:
         """Run jobs on the pool, results in order."""
         if len(jobs) < 2:
             return [job() for job in jobs]
         return list(self._pool.map(lambda job: job(), jobs))
+
+
+def _bits(frame: FlowFrame) -> bytes | None:
+    """What tells bridges over the same frame apart."""
+    return None if frame.bridged is None else np.packbits(frame.bridged).tobytes()
 
 
 def _close(one: Array | None, other: Array | None) -> bool:

@@ -1,14 +1,23 @@
-"""Pictures without what the user's mask covers, so that a search does not follow it."""
+"""Pictures without what moves, so that a search does not follow it.
+
+The coarse levels of a search see what is large and has texture, and lead what is near it astray.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["without"]
+from droidw_plugins.correspondence._flow_types import Array, Edge
+
+if TYPE_CHECKING:
+    from droidw_plugins.correspondence._flow_types import FlowFrame
+
+__all__ = ["bridge", "surer", "without"]
 
 Picture = npt.NDArray[np.uint8]
 
@@ -17,6 +26,8 @@ _MARGIN = 2
 # Smallest side of the coarsest level, and the share of known pixels that counts as some.
 _COARSEST = 2
 _SOME = 1e-3
+# Share of cells below which a bridge is not worth a second search.
+_FEW = 0.02
 
 
 def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
@@ -45,3 +56,30 @@ def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
         bridge = level + above * (1.0 - share)
     filled = np.clip(bridge + 0.5, 0, 255).astype(np.uint8)
     return np.where(covered > 0, filled, grey)
+
+
+def bridge(frame: FlowFrame, gate: Array, below: float) -> FlowFrame:
+    """The frame with a bridge over the cells whose gate [h,w] is less than `below`.
+
+    It is the frame itself where these are too few to matter. Texture stays that of the picture.
+    """
+    closed = gate < below
+    if closed.mean() < _FEW:
+        return frame
+    height, width = frame.grey.shape
+    mask: Any = cv2.resize(closed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+    return replace(frame, grey=without(frame.grey, mask > 0), bridged=closed)
+
+
+def surer(edge: Edge, other: Edge, bridged: npt.NDArray[np.bool_] | None) -> Edge:
+    """The edge, with those matches of another search of it that are surer.
+
+    Args:
+        bridged: [h,w] cells of which the other search knows nothing; None: nowhere.
+    """
+    better = other.confidence[..., :2].sum(-1) > edge.confidence[..., :2].sum(-1)
+    if bridged is not None:
+        better &= ~bridged
+    target = np.where(better[..., None], other.target, edge.target)
+    confidence = np.where(better[..., None], other.confidence, edge.confidence)
+    return replace(edge, target=target, confidence=confidence)

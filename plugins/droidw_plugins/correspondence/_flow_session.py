@@ -10,7 +10,7 @@ import torch
 
 from droidw.geometry.transfer import upload
 from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate
-from droidw_plugins.correspondence._flow_types import Array, Edge
+from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
 if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow import FlowCorrespondence
@@ -36,7 +36,7 @@ class FlowSession:
         """Measure what is new or has moved away; return the state of all edges."""
         coords = request.coords.detach().cpu().numpy()
         new = [row for row, edge_id in enumerate(request.ids) if edge_id not in self._edges]
-        wanted = sorted(new + self._astray(request, coords))
+        wanted = sorted({*new, *self._astray(request, coords), *self._blind(request)})
         if self._one_way:
             self._measure_one_way(request, wanted)
         else:
@@ -49,6 +49,13 @@ class FlowSession:
         target = torch.from_numpy(np.stack([e.target for e in edges]))
         confidence = torch.from_numpy(np.stack([e.confidence for e in edges]))
         return EdgeUpdate(upload(target, device), upload(confidence, device))
+
+    def _blind(self, request: EdgeRequest) -> list[int]:
+        """Rows searched before geometry could be believed, once it can."""
+        if self._one_way or not request.informed:
+            return []
+        known = [self._edges.get(edge_id) for edge_id in request.ids]
+        return [row for row, edge in enumerate(known) if edge is not None and edge.blind]
 
     def _astray(self, request: EdgeRequest, coords: Array) -> list[int]:
         """Rows where most confident cells lie far from the prediction of good geometry."""
@@ -95,15 +102,28 @@ class FlowSession:
                 return None
             return coords[row] if valid[row].mean() > 0.5 else None
 
+        bridged = self._bridged(request, sorted({node for key in pairs for node in key}))
+
         def job(key: tuple[int, int], rows: dict[bool, int]) -> Callable[[], Any]:
             a, b = request.payload(key[0]), request.payload(key[1])
             starts = start(rows.get(True)), start(rows.get(False))
-            return lambda: self._owner.both_ways(a, b, *starts, self._fine)
+            without = (bridged[key[0]], bridged[key[1]]) if bridged else None
+            return lambda: self._owner.both_ways(a, b, *starts, self._fine, without)
 
         measured = self._owner.map([job(key, rows) for key, rows in pairs.items()])
         for rows, both in zip(pairs.values(), measured, strict=True):
             for forward, row in rows.items():
                 edge = both[0 if forward else 1]
                 old = self._edges.get(request.ids[row])
-                edge.searches = old.searches + 1 if old else 1
+                edge.searches = old.searches + 1 if old and not old.blind else 1
+                edge.blind = not request.informed
                 self._edges[request.ids[row]] = edge
+
+    def _bridged(self, request: EdgeRequest, nodes: list[int]) -> dict[int, FlowFrame]:
+        """The pictures of these nodes without what moves; empty where that is not known."""
+        if request.gates is None or not nodes or self._owner.options.bridge == 0:
+            return {}
+        gates = request.gates(nodes).cpu().numpy()
+        frames = [request.payload(node) for node in nodes]
+        jobs = [self._owner.bridging(f, g) for f, g in zip(frames, gates, strict=True)]
+        return dict(zip(nodes, self._owner.map(jobs), strict=True))

@@ -27,6 +27,7 @@ class FlowFrame:
             eigenvalues of the structure tensor, larger first, (grey levels per pixel)^2.
         normal: [h,w,2] unit vector across the strongest edge, x and y.
         centres: [h,w,2] of the cells, pixels.
+        bridged: [h,w] cells over which `grey` is a smooth bridge, see `_flow_mask`; None: nowhere.
     """
 
     index: int
@@ -36,16 +37,24 @@ class FlowFrame:
     normal: Array
     centres: Array
     stride: int
+    bridged: npt.NDArray[np.bool_] | None = None
 
 
 @dataclass
 class Edge:
-    """What is known of one directed edge: target [h,w,2] in cells, and confidence [h,w,3]."""
+    """What is known of one directed edge: target [h,w,2] in cells, and confidence [h,w,3].
+
+    Attributes:
+        started: [h,w,2] targets from which the search started; None: free.
+        searches: how often it was searched.
+        blind: searched before geometry could be believed.
+    """
 
     target: Array
     confidence: Array
     started: Array | None
     searches: int = 1
+    blind: bool = False
 
 
 @dataclass(frozen=True)

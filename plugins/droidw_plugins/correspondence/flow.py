@@ -66,6 +66,15 @@ class FlowOptions:
         },
     )
     restarts: int = field(default=1, metadata={"help": "repeated searches per edge", "ge": 0})
+    bridge: float = field(
+        default=0.5,
+        metadata={
+            "help": "gate of uncertainty below which a cell is taken out of the picture for a "
+            "second search, whose matches count where they are surer (0: no second search)",
+            "ge": 0.0,
+            "le": 1.0,
+        },
+    )
     still: float = field(
         default=0.35, metadata={"help": "flow that counts as no motion, in pixels", "ge": 0.0}
     )

@@ -1,0 +1,56 @@
+"""What correspondence is told of uncertainty."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.config.schema import WeightingConfig
+from droidw.geometry.camera import Grid
+from droidw.graph.factors import FactorGraph
+from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.interfaces.correspondence import EdgeUpdate
+from droidw.slam.optimise import Optimiser, Parts
+from droidw.slam.timing import Stopwatch
+
+
+class Asked:
+    """A session that keeps the request and measures no motion."""
+
+    def update(self, request):
+        self.request = request
+        confidence = torch.ones(*request.coords.shape[:3], 2)
+        return EdgeUpdate(request.coords, confidence)
+
+
+def two_keyframes():
+    store = KeyframeStore(Grid(6, 8, 8, 3.5), torch.tensor([60.0, 60.0, 31.5, 23.5]))
+    for k, u in enumerate((0.0, 2.0)):
+        blank = np.zeros((48, 64, 3), np.uint8)
+        info = KeyframeInfo(k, k / 10, "", blank, None)
+        pose = torch.tensor([0.1 * k, 0, 0, 0, 0, 0, 1])
+        store.append(info, T_cw=pose, uncertainty=torch.full((6, 8), u))
+    store["unmasked"][0, 0, 0] = 0.0
+    graph = FactorGraph(6, 8)
+    graph.add([(0, 1), (1, 0)])
+    parts = Parts(None, None, None, None, None)
+    optimiser = Optimiser(store, parts, WeightingConfig(), Stopwatch())
+    return optimiser, graph
+
+
+@pytest.mark.parametrize("informed", [True, False])
+@pytest.mark.parametrize("learned", [True, False])
+def test_gates_are_given_where_geometry_and_uncertainty_count(informed, learned):
+    optimiser, graph = two_keyframes()
+    session = Asked()
+    optimiser.measure(graph, session, graph.select(), informed, learned)
+    assert session.request.informed is informed
+    if not (informed and learned):
+        assert session.request.gates is None
+        return
+    gates = session.request.gates([1, 0])
+    assert gates.shape == (2, 6, 8)
+    # 1 / (45 * 2 - 35) of the second keyframe; user's masks are not uncertainty
+    assert gates[0].unique().tolist() == pytest.approx([1 / 55])
+    assert gates[1].unique().tolist() == [1.0]
