@@ -54,6 +54,12 @@ RUNS = {
 MORE = {"cnn without calibration", "dinov2", "metric3d", "droid, low memory", "a guarded step"}
 """Left to `--runslow`: of these, too, some other run has most."""
 
+APART = {"refresh and tolerance": 1e-2}
+"""Share of the path by which centres may differ, elsewhere 2e-3.
+
+Where learning stops at a tolerance, rounding decides when; and searches start from what comes of it.
+"""
+
 
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in MORE)) for name in RUNS]
@@ -63,8 +69,9 @@ def test_a_run_is_that_of_the_cpu(either, clip, name):
     if "depth=file" in arguments:
         arguments = (*arguments, f"depth.options.path={clip / 'depth'}")
     cpu, there, gpu = either(*arguments)
+    apart = APART.get(name, 2e-3)
     # Sums in another order (uncertainty has kernels on a CPU) go through all of Gauss-Newton.
-    np.testing.assert_allclose(there, cpu, atol=2e-3 * np.ptp(cpu, axis=0).max() + 1e-6)
+    np.testing.assert_allclose(there, cpu, atol=apart * np.ptp(cpu, axis=0).max() + 1e-6)
     assert np.ptp(cpu, axis=0).max() > 0, "nothing moved, so that nothing was compared"
     assert gpu.streams.faults == []
     assert gpu.total() > 0

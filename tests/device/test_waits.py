@@ -62,8 +62,9 @@ def test_waits_of_the_inner_loop(watch, arguments):
     assert set(counts["step"]) == {2}, told
     # One look at the energy, and whether the parameters are finite.
     assert set(counts["learn"]) == {1}, told
-    # Flow is searched on the host, from what geometry predicts: coordinates, and which are valid.
-    most = 2 if arguments is FLOW else 0
+    # Flow is searched on the host, from what geometry predicts: coordinates, which of them are
+    # valid, and the gates of uncertainty.
+    most = 3 if arguments is FLOW else 0
     assert max(counts["measure"]) == most, told
     # The mean flow decides whether a frame becomes a keyframe.
     assert set(counts["judge"]) == {0 if arguments is FLOW else 1} | {0}, told
