@@ -170,4 +170,3 @@ def test_open_gates_and_no_bridge_change_nothing():
         after = gated(frames, gates, **options)[1]
         assert torch.equal(after[0], plain[0])
         assert torch.equal(after[1], plain[1])
-

@@ -57,7 +57,7 @@ MORE = {"cnn without calibration", "dinov2", "metric3d", "droid, low memory", "a
 APART = {"refresh and tolerance": 1e-2}
 """Share of the path by which centres may differ, elsewhere 2e-3.
 
-Where learning stops at a tolerance, rounding decides when; and searches start from what comes of it.
+Where learning stops at a tolerance, rounding decides when; searches start from what comes of it.
 """
 
 

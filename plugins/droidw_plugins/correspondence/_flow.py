@@ -205,9 +205,9 @@ class FlowCorrespondence:
             bridged: the frames without what moves; what a second search finds between these is
                 taken where it is surer.
         """
-        if bridged is not None and bridged[0] is a and bridged[1] is b:
-            bridged = None
-        key = (a.index, b.index, fine, *(_bits(f) for f in bridged or ()))
+        c, d = bridged or (a, b)
+        again = c.bridged is not None or d.bridged is not None
+        key = (a.index, b.index, fine, _bits(c), _bits(d))
         with self._lock:
             known = self._pairs.get(key)
         if known is not None and all(
@@ -217,8 +217,7 @@ class FlowCorrespondence:
             return replace(known[0]), replace(known[1])
         ab, ba = self._started(a, b, start_ab, fine), self._started(b, a, start_ba, fine)
         both = self._checked(a, ab, ba, start_ab), self._checked(b, ba, ab, start_ba)
-        if bridged is not None:
-            c, d = bridged
+        if again:
             ab, ba = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
             both = (
                 surer(both[0], self._checked(a, ab, ba, start_ab), c.bridged),

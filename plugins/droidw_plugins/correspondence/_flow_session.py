@@ -36,11 +36,14 @@ class FlowSession:
         """Measure what is new or has moved away; return the state of all edges."""
         coords = request.coords.detach().cpu().numpy()
         new = [row for row, edge_id in enumerate(request.ids) if edge_id not in self._edges]
-        wanted = sorted({*new, *self._astray(request, coords), *self._blind(request)})
+        wanted = {*new, *self._astray(request, coords)}
+        blind = self._blind(request)
+        bridged = self._bridged(request, sorted(wanted.union(blind)))
+        wanted.update(row for row in blind if any(n in bridged for n in _ends(request, row)))
         if self._one_way:
-            self._measure_one_way(request, wanted)
+            self._measure_one_way(request, sorted(wanted))
         else:
-            self._measure_pairs(request, wanted, coords)
+            self._measure_pairs(request, sorted(wanted), coords, bridged)
         if not request.ids:
             none = torch.zeros_like(request.coords)
             return EdgeUpdate(none, none.new_zeros(*none.shape[:3], 3))
@@ -51,8 +54,11 @@ class FlowSession:
         return EdgeUpdate(upload(target, device), upload(confidence, device))
 
     def _blind(self, request: EdgeRequest) -> list[int]:
-        """Rows searched before geometry could be believed, once it can."""
-        if self._one_way or not request.informed:
+        """Rows searched before geometry could be believed, once uncertainty can be, too.
+
+        Without it a search that starts from poses which follow what moves would only confirm them.
+        """
+        if request.gates is None:
             return []
         known = [self._edges.get(edge_id) for edge_id in request.ids]
         return [row for row, edge in enumerate(known) if edge is not None and edge.blind]
@@ -88,7 +94,13 @@ class FlowSession:
         for row, edge in zip(wanted, self._owner.map([job(r) for r in wanted]), strict=True):
             self._edges[request.ids[row]] = edge
 
-    def _measure_pairs(self, request: EdgeRequest, wanted: list[int], coords: Array) -> None:
+    def _measure_pairs(
+        self,
+        request: EdgeRequest,
+        wanted: list[int],
+        coords: Array,
+        bridged: dict[int, FlowFrame],
+    ) -> None:
         """One job per unordered pair, since the check needs both directions anyway."""
         pairs: dict[tuple[int, int], dict[bool, int]] = {}
         for row in wanted:
@@ -102,12 +114,10 @@ class FlowSession:
                 return None
             return coords[row] if valid[row].mean() > 0.5 else None
 
-        bridged = self._bridged(request, sorted({node for key in pairs for node in key}))
-
         def job(key: tuple[int, int], rows: dict[bool, int]) -> Callable[[], Any]:
             a, b = request.payload(key[0]), request.payload(key[1])
             starts = start(rows.get(True)), start(rows.get(False))
-            without = (bridged[key[0]], bridged[key[1]]) if bridged else None
+            without = bridged.get(key[0], a), bridged.get(key[1], b)
             return lambda: self._owner.both_ways(a, b, *starts, self._fine, without)
 
         measured = self._owner.map([job(key, rows) for key, rows in pairs.items()])
@@ -119,11 +129,18 @@ class FlowSession:
                 edge.blind = not request.informed
                 self._edges[request.ids[row]] = edge
 
-    def _bridged(self, request: EdgeRequest, nodes: list[int]) -> dict[int, FlowFrame]:
-        """The pictures of these nodes without what moves; empty where that is not known."""
-        if request.gates is None or not nodes or self._owner.options.bridge == 0:
+    def _bridged(self, request: EdgeRequest, rows: list[int]) -> dict[int, FlowFrame]:
+        """By node: pictures of these edges with something to leave out, and without it."""
+        if request.gates is None or not rows or self._owner.options.bridge == 0:
             return {}
+        nodes = sorted({node for row in rows for node in _ends(request, row)})
         gates = request.gates(nodes).cpu().numpy()
         frames = [request.payload(node) for node in nodes]
         jobs = [self._owner.bridging(f, g) for f, g in zip(frames, gates, strict=True)]
-        return dict(zip(nodes, self._owner.map(jobs), strict=True))
+        made = zip(nodes, self._owner.map(jobs), strict=True)
+        return {node: frame for node, frame in made if frame.bridged is not None}
+
+
+def _ends(request: EdgeRequest, row: int) -> tuple[int, int]:
+    """The nodes of an edge."""
+    return request.ii[row], request.jj[row]
