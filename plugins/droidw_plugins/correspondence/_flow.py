@@ -20,7 +20,7 @@ from droidw_plugins.correspondence._flow_information import (
     structure,
     trust,
 )
-from droidw_plugins.correspondence._flow_mask import bridge, surer, without
+from droidw_plugins.correspondence._flow_mask import surer, without
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Track
 
@@ -193,7 +193,8 @@ class FlowCorrespondence:
         start_ab: Array | None,
         start_ba: Array | None,
         fine: bool = False,
-        bridged: tuple[FlowFrame, FlowFrame] | None = None,
+        *,
+        bridged: tuple[FlowFrame, FlowFrame],
     ) -> tuple[Edge, Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
@@ -202,10 +203,10 @@ class FlowCorrespondence:
         Args:
             a, b: frames. start_ab, start_ba: targets [h,w,2] to start from; None: free.
             fine: at the scale of global adjustment.
-            bridged: the frames without what moves; what a second search finds between these is
-                taken where it is surer.
+            bridged: the frames without what moves, or themselves; what a second search finds
+                between these is taken where it is surer.
         """
-        c, d = bridged or (a, b)
+        c, d = bridged
         again = c.bridged is not None or d.bridged is not None
         key = (a.index, b.index, fine, _bits(c), _bits(d))
         with self._lock:
@@ -268,10 +269,6 @@ class FlowCorrespondence:
         confidence = information(a, *agreed, self.options.texture)
         target = ((there - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, started)
-
-    def bridging(self, frame: FlowFrame, gate: Array) -> Callable[[], FlowFrame]:
-        """A job that makes the frame without what uncertainty rejects."""
-        return lambda: bridge(frame, gate, self.options.bridge)
 
     def map(self, jobs: list[Callable[[], Any]]) -> list[Any]:
         """Run jobs on the pool, results in order."""

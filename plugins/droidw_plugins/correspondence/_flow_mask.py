@@ -6,16 +6,13 @@ The coarse levels of a search see what is large and has texture, and lead what i
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from droidw_plugins.correspondence._flow_types import Array, Edge
-
-if TYPE_CHECKING:
-    from droidw_plugins.correspondence._flow_types import FlowFrame
+from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
 __all__ = ["bridge", "surer", "without"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 
 from droidw.geometry.transfer import upload
 from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate
+from droidw_plugins.correspondence._flow_mask import bridge
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
 if TYPE_CHECKING:
@@ -118,7 +120,7 @@ class FlowSession:
             a, b = request.payload(key[0]), request.payload(key[1])
             starts = start(rows.get(True)), start(rows.get(False))
             without = bridged.get(key[0], a), bridged.get(key[1], b)
-            return lambda: self._owner.both_ways(a, b, *starts, self._fine, without)
+            return lambda: self._owner.both_ways(a, b, *starts, self._fine, bridged=without)
 
         measured = self._owner.map([job(key, rows) for key, rows in pairs.items()])
         for rows, both in zip(pairs.values(), measured, strict=True):
@@ -131,12 +133,15 @@ class FlowSession:
 
     def _bridged(self, request: EdgeRequest, rows: list[int]) -> dict[int, FlowFrame]:
         """By node: pictures of these edges with something to leave out, and without it."""
-        if request.gates is None or not rows or self._owner.options.bridge == 0:
+        below = self._owner.options.bridge
+        if request.gates is None or not rows or below == 0:
             return {}
         nodes = sorted({node for row in rows for node in _ends(request, row)})
         gates = request.gates(nodes).cpu().numpy()
         frames = [request.payload(node) for node in nodes]
-        jobs = [self._owner.bridging(f, g) for f, g in zip(frames, gates, strict=True)]
+        jobs: list[Callable[[], Any]] = [
+            partial(bridge, f, g, below) for f, g in zip(frames, gates, strict=True)
+        ]
         made = zip(nodes, self._owner.map(jobs), strict=True)
         return {node: frame for node, frame in made if frame.bridged is not None}
 
