@@ -8,8 +8,6 @@ import torch
 
 from droidw.geometry.camera import Grid
 from droidw.interfaces.correspondence import EdgeRequest
-from droidw.plugin.component import BuildContext
-from droidw.slam.frame import Frame
 from droidw_plugins.correspondence import flow
 from droidw_plugins.correspondence._flow_information import information, structure, trust
 from droidw_plugins.correspondence._flow_types import FlowFrame
@@ -35,27 +33,17 @@ def blobs(shift=(0.0, 0.0)):
     return 128 + sum(stripes(degrees, shift, periods) - 128 for degrees, periods in crossed) / 2
 
 
-def frame(index, grey):
-    image = torch.from_numpy(grey / 255).expand(3, -1, -1).contiguous()
-    return Frame(index, index / 10, image, torch.tensor([200.0, 200.0, 104.0, 80.0]), str(index))
+@pytest.fixture(scope="module")
+def measured(operator, frame, question):
+    """Displacement [h,w,2] in cells and confidence [h,w,3] from the first picture to the second."""
 
+    def call(first, second, purpose="window", **options):
+        part = operator(**options)
+        request = question(part, [frame(n, grey) for n, grey in enumerate((first, second))])
+        answer = part.session(purpose).update(request)
+        return answer.target[0] - request.coords[0], answer.confidence[0].double()
 
-def operator(**options):
-    made = flow.COMPONENT.options(workers=1, **options)
-    return flow.COMPONENT.factory(made, BuildContext(device=torch.device("cpu")))
-
-
-def measured(first, second, purpose="window", **options):
-    part = operator(**options)
-    payload = [part.encode(frame(n, grey), GRID) for n, grey in enumerate((first, second))]
-    y, x = torch.meshgrid(
-        torch.arange(float(GRID.height)), torch.arange(float(GRID.width)), indexing="ij"
-    )
-    coords = torch.stack([x, y], dim=-1)[None]
-    valid = torch.ones(coords.shape[:3], dtype=torch.bool)
-    request = EdgeRequest([0], [0], [1], coords, valid, payload.__getitem__, informed=False)
-    answer = part.session(purpose).update(request)
-    return answer.target[0] - coords[0], answer.confidence[0].double()
+    return call
 
 
 def along(confidence, degrees):
@@ -72,7 +60,7 @@ def is_information(confidence):
 
 @pytest.mark.parametrize("purpose", ["window", "fill"])
 @pytest.mark.parametrize("degrees", ANGLES)
-def test_a_line_is_known_across_and_not_along(degrees, purpose):
+def test_a_line_is_known_across_and_not_along(degrees, purpose, measured):
     n = np.deg2rad(degrees)
     moved = 2 * np.array([np.cos(n), np.sin(n)]) + 1.5 * np.array([-np.sin(n), np.cos(n)])
     # lines without a mark and without an end: nothing keeps a match from slipping far
@@ -87,28 +75,28 @@ def test_a_line_is_known_across_and_not_along(degrees, purpose):
     assert float((step[INNER] * STRIDE - 2).abs().median()) < 0.5
 
 
-def test_the_two_weights_alone_would_call_a_slanted_line_known_along_it():
+def test_the_two_weights_alone_would_call_a_slanted_line_known_along_it(measured):
     _, confidence = measured(stripes(45), stripes(45, (2.0, 2.0)))
     two = torch.cat([confidence[..., :2], torch.zeros_like(confidence[..., :1])], dim=-1)
     assert float(along(two, 135)[INNER].median()) > 0.3
     assert float(along(confidence, 135)[INNER].median()) < 0.02
 
 
-def test_a_picture_of_blobs_is_known_in_every_direction():
+def test_a_picture_of_blobs_is_known_in_every_direction(measured):
     _, confidence = measured(blobs(), blobs((2.0, 1.0)))
     assert is_information(confidence)
     for degrees in ANGLES:
         assert float(along(confidence, degrees)[INNER].median()) > 0.6
 
 
-def test_a_blank_picture_says_nothing():
+def test_a_blank_picture_says_nothing(measured):
     blank = np.full((HEIGHT, WIDTH), 90.0, dtype=np.float32)
     for purpose in ("window", "fill"):
         _, confidence = measured(blank, blank, purpose)
         assert float(confidence.abs().max()) < 1e-6
 
 
-def test_without_texture_the_agreement_alone_counts():
+def test_without_texture_the_agreement_alone_counts(measured):
     blank = np.full((HEIGHT, WIDTH), 90.0, dtype=np.float32)
     _, confidence = measured(blank, blank, texture=0.0)
     assert torch.equal(confidence[INNER], torch.tensor([1.0, 1.0, 0.0]).expand(12, 18, 3).double())
@@ -165,7 +153,7 @@ def test_information_is_the_sum_of_both_directions():
     assert is_information(torch.from_numpy(found).double())
 
 
-def test_no_edges_have_three_channels_too():
+def test_no_edges_have_three_channels_too(operator):
     part = operator()
     none = torch.zeros(0, GRID.height, GRID.width, 2)
     request = EdgeRequest([], [], [], none, none[..., 0] > 0, [].__getitem__)

@@ -9,10 +9,6 @@ import pytest
 import torch
 
 from droidw.geometry.camera import Grid
-from droidw.interfaces.correspondence import EdgeRequest
-from droidw.plugin.component import BuildContext
-from droidw.slam.frame import Frame
-from droidw_plugins.correspondence import flow
 from droidw_plugins.correspondence._flow_mask import without
 
 HEIGHT, WIDTH = 160, 208
@@ -58,46 +54,52 @@ def test_masks_of_nothing_and_of_all(share):
         assert np.array_equal(bridged, grey)
 
 
-def frame(index, grey, mask=None):
-    image = torch.from_numpy(grey / 255).float().expand(3, -1, -1).contiguous()
-    camera = torch.tensor([200.0, 200.0, 104.0, 80.0])
-    known = None if mask is None else torch.from_numpy(mask)
-    return Frame(index, index / 10, image, camera, str(index), known)
-
-
-def pair(shift, other, contrast=1.0):
+@pytest.fixture
+def pair(frame):
     """Two frames of a picture that moves by `shift` px, with a patch that moves by `other` px."""
-    scene, patch = 128 + contrast * (grain(2) - 128), grain(3)
-    masks = [hole(), hole(left=64 + other)]
-    pictures = [scene, np.roll(scene, shift, axis=1)]
-    patches = [patch, np.roll(patch, other, axis=1)]
-    made = [np.where(m, p, s) for m, p, s in zip(masks, patches, pictures, strict=True)]
-    return [frame(n, grey, m) for n, (grey, m) in enumerate(zip(made, masks, strict=True))]
+
+    def call(shift, other, contrast=1.0):
+        scene, patch = 128 + contrast * (grain(2) - 128), grain(3)
+        masks = [hole(), hole(left=64 + other)]
+        pictures = [scene, np.roll(scene, shift, axis=1)]
+        patches = [patch, np.roll(patch, other, axis=1)]
+        made = [np.where(m, p, s) for m, p, s in zip(masks, patches, pictures, strict=True)]
+        return [frame(n, grey, m) for n, (grey, m) in enumerate(zip(made, masks, strict=True))]
+
+    return call
 
 
-def measured(frames):
-    """Displacement [h,w,2] px and confidence [h,w,3] from the first to the second."""
-    options = flow.COMPONENT.options(workers=1)
-    part = flow.COMPONENT.factory(options, BuildContext(device=torch.device("cpu")))
-    payload = [part.encode(f, GRID) for f in frames]
-    y, x = torch.meshgrid(
-        torch.arange(float(GRID.height)), torch.arange(float(GRID.width)), indexing="ij"
-    )
-    coords = torch.stack([x, y], dim=-1)[None]
-    valid = torch.ones(coords.shape[:3], dtype=torch.bool)
-    request = EdgeRequest([0], [0], [1], coords, valid, payload.__getitem__, informed=False)
-    answer = part.session("window").update(request)
-    return 8 * (answer.target[0] - coords[0]), answer.confidence[0]
+@pytest.fixture
+def measured(operator, question):
+    """Displacement [h,w,2] px and confidence [h,w,3] from the first to the second.
+
+    With gates [2,h,w] of uncertainty besides what is measured once these are known.
+    """
+
+    def call(frames, gates=None, **options):
+        part = operator(**options)
+        blind = question(part, frames)
+        asked = [blind]
+        if gates is not None:
+            unknown = torch.zeros_like(blind.valid)
+            blind = replace(blind, valid=unknown)
+            known = replace(blind, informed=True, gates=lambda nodes: gates[list(nodes)])
+            asked = [blind, known]
+        session = part.session("window")
+        answers = [session.update(request) for request in asked]
+        return [(8 * (a.target[0] - blind.coords[0]), a.confidence[0]) for a in answers]
+
+    return call
 
 
-def test_what_is_masked_does_not_pull_at_its_surroundings():
+def test_what_is_masked_does_not_pull_at_its_surroundings(pair, measured):
     frames = pair(shift=-6, other=10, contrast=0.1)
     ring = torch.zeros(GRID.height, GRID.width, dtype=torch.bool)
     ring[4:16, 5:21] = True
     ring[6:14, 8:20] = False  # where the patch is in either frame
     wrong = []
     for given in (frames, [replace(f, mask=None) for f in frames]):
-        moved, confidence = measured(given)
+        [(moved, confidence)] = measured(given)
         off = (moved - torch.tensor([-6.0, 0.0])).norm(dim=-1)
         trusted = confidence[..., :2].mean(-1)
         wrong.append(float((trusted * (off > 2))[ring].sum() / trusted[ring].sum()))
@@ -108,33 +110,14 @@ def test_what_is_masked_does_not_pull_at_its_surroundings():
     assert wrong[0] < 0.05
 
 
-def test_motion_is_that_of_what_is_left():
+def test_motion_is_that_of_what_is_left(pair, operator):
     frames = pair(shift=0, other=12)
-    options = flow.COMPONENT.options(workers=1)
 
     def motion(given):
-        part = flow.COMPONENT.factory(options, BuildContext(device=torch.device("cpu")))
+        part = operator()
         return part.motion(*(part.encode(f, GRID) for f in given)).flow
 
     assert motion(frames) < 0.3 * motion([replace(f, mask=None) for f in frames])
-
-
-def gated(frames, gates, **options):
-    """As `measured`, with gates [2,h,w] of uncertainty; blind first, then informed."""
-    part = flow.COMPONENT.factory(
-        flow.COMPONENT.options(workers=1, **options), BuildContext(device=torch.device("cpu"))
-    )
-    payload = [part.encode(f, GRID) for f in frames]
-    y, x = torch.meshgrid(
-        torch.arange(float(GRID.height)), torch.arange(float(GRID.width)), indexing="ij"
-    )
-    coords = torch.stack([x, y], dim=-1)[None]
-    valid = torch.zeros(coords.shape[:3], dtype=torch.bool)
-    blind = EdgeRequest([0], [0], [1], coords, valid, payload.__getitem__, informed=False)
-    knowing = replace(blind, informed=True, gates=lambda nodes: gates[list(nodes)])
-    session = part.session("window")
-    answers = [session.update(request) for request in (blind, knowing)]
-    return [(8 * (a.target[0] - coords[0]), a.confidence[0]) for a in answers]
 
 
 def closed():
@@ -145,9 +128,9 @@ def closed():
     return gates
 
 
-def test_what_uncertainty_rejects_does_not_pull_at_its_surroundings():
+def test_what_uncertainty_rejects_does_not_pull_at_its_surroundings(pair, measured):
     frames = [replace(f, mask=None) for f in pair(shift=-6, other=10, contrast=0.1)]
-    (before, sure_before), (after, sure_after) = gated(frames, closed())
+    (before, sure_before), (after, sure_after) = measured(frames, closed())
     truth = torch.tensor([-6.0, 0.0])
     right = [
         float((c[..., :2].mean(-1) * ((m - truth).norm(dim=-1) < 1)).sum())
@@ -160,13 +143,13 @@ def test_what_uncertainty_rejects_does_not_pull_at_its_surroundings():
     assert float((after[patch] - torch.tensor([10.0, 0.0])).norm(dim=-1).median()) < 0.5
 
 
-def test_open_gates_and_no_bridge_change_nothing():
+def test_open_gates_and_no_bridge_change_nothing(pair, measured):
     frames = [replace(f, mask=None) for f in pair(shift=-6, other=10, contrast=0.1)]
-    plain = measured(frames)
+    [plain] = measured(frames)
     for gates, options in (
         (torch.ones(2, GRID.height, GRID.width), {}),
         (closed(), {"bridge": 0.0}),
     ):
-        after = gated(frames, gates, **options)[1]
+        after = measured(frames, gates, **options)[1]
         assert torch.equal(after[0], plain[0])
         assert torch.equal(after[1], plain[1])
