@@ -20,7 +20,7 @@ DROID = (
 )  # fmt: skip
 SMALL = "depth.options={variant: vit-small, size: [56, 84], precision: float32}"
 RUNS = {
-    "the preset cpu": (*FLOW,),
+    "the preset cpu with one search": (*FLOW,),
     "two searches": (*CPU,),
     "match, and residuals both ways": (
         *FLOW, "frontend.predict=match", "weighting.bidirectional=true", "camera.refine_focal=true",

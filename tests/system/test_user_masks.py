@@ -81,6 +81,6 @@ def test_masks_that_do_not_fit(go, postered, tmp_path):
         cv2.imwrite(str(other / f"{k:04d}.png"), np.zeros((90, 90), np.uint8))
     ran = go(clip.folder, "--masks", other)
     assert ran.code == 3
-    assert "a mask of 90x90 pixels" in ran.err
+    assert "a mask of 90x90 pixels (picture 0000.png) does not fit pictures of 160x120" in ran.err
     ran = go(clip.folder, "--masks", tmp_path / "none")
     assert ran.code == 3 and "there is no such folder" in ran.err
