@@ -44,7 +44,8 @@ class KeyframeStore:
     Core fields, each [N,...] and returned as views into the storage:
         T_cw [7] world to camera; disps [h,w] inverse depth; prior [h,w] inverse depth of the
         depth prior (0: none); features [c,h,w]; uncertainty [h,w]; damping [h,w] learned;
-        unmasked [h,w] in [0,1], the share of a cell that the user's mask leaves.
+        unmasked [h,w] in [0,1], the share of a cell that the user's mask leaves; movable [h,w] in
+        [0,1], how likely features find what can move by itself (0: not asked).
 
     Args:
         grid: the grid on which maps live.
@@ -77,6 +78,7 @@ class KeyframeStore:
             StoreField("uncertainty", ("h", "w")),
             StoreField("damping", ("h", "w"), fill=1e-6),
             StoreField("unmasked", ("h", "w"), fill=1.0),
+            StoreField("movable", ("h", "w")),
         )
         self._declared: dict[str, StoreField] = {}
         sizes = {"h": grid.height, "w": grid.width, "c": feature_dim}

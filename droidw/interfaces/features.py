@@ -25,6 +25,10 @@ class FeatureExtractor(Protocol):
     It may also have `calibrated`: true if the cosine of its features is on droidw's scale already
     (at measured matches three quarters are above 0.895 and half above 0.93, docs/features.md).
     Uncertainty models then take it as it is; without it they bring it there themselves.
+
+    And it may have a method `movable(image, grid)`, with the arguments of `extract`: the
+    probability [h,w] that a cell shows what can move by itself, such as a person, an animal or a
+    vehicle, whether it does or not. Uncertainty models may start from that; nobody needs it.
     """
 
     dim: int

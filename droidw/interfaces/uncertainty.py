@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -54,6 +54,7 @@ class UncertaintyView:
         frames: [K] int64 keyframes whose maps are to be refreshed.
         iteration: counts updates since the start of the run.
         host: `ii`, `jj` and `frames` once more as lists; see `indices`.
+        gate: the weights in [0,1] that uncertainties [N,h,w] leave; None: all of it.
         calibrate: similarities of these features are to be brought to the scale on which
             thresholds are meant (docs/features.md); false: their cosine is taken as it is.
     """
@@ -70,6 +71,7 @@ class UncertaintyView:
     confidence: Tensor
     frames: Tensor
     iteration: int = 0
+    gate: Callable[[Tensor], Tensor] | None = None
     calibrate: bool = False
     host: Indices | None = None
 
@@ -94,6 +96,11 @@ class UncertaintyModel(Protocol):
 
     Attributes:
         fields: tensors that the model keeps per keyframe.
+
+    A model may also have `begins`, true if it wants to know what can move before any motion is
+    known. It then has a method `begin(view, movable)`, which writes `view.uncertainty` of
+    `view.frames`, the keyframes of the initialisation, from what the extractor's `movable` says of
+    them, [N,h,w]. It is called once, before the first search, and only with such an extractor.
     """
 
     fields: tuple[StoreField, ...]

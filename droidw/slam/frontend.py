@@ -17,7 +17,7 @@ from droidw.slam.locate import carry_depth, locate
 from droidw.slam.starts import mirrored, plane_starts
 
 if TYPE_CHECKING:
-    from droidw.config.schema import DroidwConfig
+    from droidw.config.schema import DroidwConfig, PhaseConfig
     from droidw.slam.optimise import Optimiser
 
 __all__ = ["Frontend"]
@@ -73,6 +73,7 @@ class Frontend:
         count = len(self.store)
         schedule, options = self.config.schedule, self.options
         self.graph.add(neighbour_edges(count, 3))
+        self.optimiser.begin()
         self._updates("init_blind", first_free=1, informed=False)
         if options.starts:
             self._try_mirrored()
@@ -97,10 +98,11 @@ class Frontend:
         """Leave the mirrored solution if that is where the first keyframes have converged to."""
         store = self.store
         found = store.T_cw.clone(), store.disps.clone()
-        cost = self._settled_cost(weigh=False)
+        weigh = self._phase("init_blind").weigh
+        cost = self._settled_cost(weigh)
         store.write(*mirrored(*found))
         self._updates("init_blind", first_free=1, informed=False)
-        if not self._settled_cost(weigh=False) < cost:
+        if not self._settled_cost(weigh) < cost:
             store.write(*found)
 
     def _try_again(self) -> bool:
@@ -134,8 +136,13 @@ class Frontend:
         self.store.write(*before)
         return self.optimiser.cost
 
+    def _phase(self, name: str) -> PhaseConfig:
+        """A row of the schedule; uncertainty that begins with something weighs from the first."""
+        row = self.config.schedule[name]
+        return replace(row, weigh=True) if name == "init_blind" and self.optimiser.begun else row
+
     def _updates(self, phase: str, first_free: int, informed: bool = True) -> None:
-        row = self.config.schedule[phase]
+        row = self._phase(phase)
         for _ in range(row.updates):
             self.optimiser.update(
                 self.graph,

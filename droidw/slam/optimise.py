@@ -63,6 +63,8 @@ class Optimiser:
         weighting: how confidence and uncertainty become weights.
         clock: where the time of each part is added up.
         published: similarities are the raw cosine, whatever `weighting` says.
+    Attributes:
+        begins: uncertainty is to be told what can move before the first search. begun: it was.
     """
 
     def __init__(
@@ -82,9 +84,22 @@ class Optimiser:
             and not published
             and not getattr(parts.features, "calibrated", False)
         )
+        self.begins = getattr(parts.uncertainty, "begins", False) and hasattr(
+            parts.features, "movable"
+        )
+        self.begun = False
         self.iterations = 0
         self.reports: dict[str, int] = {}
         self.cost = float("nan")
+
+    def begin(self) -> None:
+        """Let uncertainty start from what features say of the keyframes so far, if it wants to."""
+        if self.begins:
+            frames = range(len(self.store))
+            view = self.view(frames=frames)
+            with self.clock("uncertainty"):
+                self.parts.uncertainty.begin(view, self.store["movable"])  # type: ignore[attr-defined]
+            self.begun = True
 
     def measure(
         self,
@@ -113,7 +128,7 @@ class Optimiser:
             valid=valid,
             payload=store.payload,
             informed=informed,
-            gates=self.learned_gates if learned and informed else None,
+            gates=self.learned_gates if learned and (informed or self.begun) else None,
         )
         with self.clock("correspondence"):
             answer = session.update(request)
@@ -279,6 +294,7 @@ class Optimiser:
             frames=on_device(list(frames), store.device),
             host=host,
             iteration=self.iterations,
+            gate=self._gate,
             calibrate=self._calibrate,
         )
 

@@ -204,9 +204,11 @@ class SlamSystem:
         prior = self._prior(frame) if current.prior is None else current.prior
         pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
         if frame.mask is not None:
-            masked = {"unmasked": 1 - self.grid.covered(upload(frame.mask, store.device))}
+            known = {"unmasked": 1 - self.grid.covered(upload(frame.mask, store.device))}
         else:
-            masked = {}
+            known = {}
+        if self.optimiser.begins and not self.frontend.initialised:
+            known["movable"] = self._movable(frame)
         number = store.append(
             KeyframeInfo(
                 frame.index, frame.time, frame.name, pixels.cpu().numpy(), current.context
@@ -215,11 +217,17 @@ class SlamSystem:
             disps=disp,
             features=features,
             prior=prior,
-            **masked,
+            **known,
         )
         with self.clock("uncertainty"):
             parts.uncertainty.append(self.optimiser.view(), number)
         return number
+
+    def _movable(self, frame: Frame) -> Tensor:
+        with self.clock("features"):
+            image = upload(frame.image, self.store.device)
+            found: Tensor = self.parts.features.movable(image, self._picked)  # type: ignore[attr-defined]
+            return found
 
     def _prior(self, frame: Frame) -> Tensor:
         device = self.store.device

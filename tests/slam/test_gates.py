@@ -54,3 +54,34 @@ def test_gates_are_given_where_geometry_and_uncertainty_count(informed, learned)
     # 1 / (45 * 2 - 35) of the second keyframe; user's masks are not uncertainty
     assert gates[0].unique().tolist() == pytest.approx([1 / 55])
     assert gates[1].unique().tolist() == [1.0]
+
+
+class Moving:
+    """Features that say what can move, and a model that begins with it."""
+
+    begins = True
+
+    def movable(self, image, grid):
+        raise AssertionError("not asked here")
+
+    def begin(self, view, movable):
+        assert list(view.indices().frames) == [0, 1]
+        view.uncertainty[:] = 2 * movable
+
+
+def test_what_can_move_is_known_before_the_first_search():
+    optimiser, graph = two_keyframes()
+    optimiser.parts = Parts(Moving(), None, Moving(), None, None)
+    optimiser.begin()
+    assert not optimiser.begun  # asked of the parts that it was built with
+    both = Optimiser(optimiser.store, optimiser.parts, WeightingConfig(), Stopwatch())
+    both.store["movable"][1] = 1.0
+    both.begin()
+    assert both.begun
+    session = Asked()
+    both.measure(graph, session, graph.select(), informed=False, learned=True)
+    gates = session.request.gates([0, 1])
+    assert gates[0].unique().tolist() == [1.0]
+    assert gates[1].unique().tolist() == pytest.approx([1 / 55])
+    both.measure(graph, session, graph.select(), informed=False, learned=False)
+    assert session.request.gates is None

@@ -220,9 +220,10 @@ class FlowCorrespondence:
         both = self._checked(a, ab, ba, start_ab), self._checked(b, ba, ab, start_ba)
         if again:
             ab, ba = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
+            share = self.options.bridged_share
             both = (
-                surer(both[0], self._checked(a, ab, ba, start_ab), c.bridged),
-                surer(both[1], self._checked(b, ba, ab, start_ba), d.bridged),
+                surer(both[0], self._checked(a, ab, ba, start_ab), c.bridged, share),
+                surer(both[1], self._checked(b, ba, ab, start_ba), d.bridged, share),
             )
         with self._lock:
             self._pairs[key] = both

@@ -68,15 +68,21 @@ def bridge(frame: FlowFrame, gate: Array, below: float) -> FlowFrame:
     return replace(frame, grey=without(frame.grey, mask > 0), bridged=closed)
 
 
-def surer(edge: Edge, other: Edge, bridged: npt.NDArray[np.bool_] | None) -> Edge:
+def surer(
+    edge: Edge, other: Edge, bridged: npt.NDArray[np.bool_] | None, share: float = 1.0
+) -> Edge:
     """The edge, with those matches of another search of it that are surer.
 
     Args:
         bridged: [h,w] cells of which the other search knows nothing; None: nowhere.
+        share: of their confidence that these keep. Gates alone leave what moves too much where
+            nine tenths of all confidence lie on it.
     """
     better = other.confidence[..., :2].sum(-1) > edge.confidence[..., :2].sum(-1)
     if bridged is not None:
         better &= ~bridged
     target = np.where(better[..., None], other.target, edge.target)
     confidence = np.where(better[..., None], other.confidence, edge.confidence)
+    if bridged is not None:
+        confidence = np.where(bridged[..., None], np.float32(share) * confidence, confidence)
     return replace(edge, target=target, confidence=confidence)

@@ -75,6 +75,14 @@ class FlowOptions:
             "le": 1.0,
         },
     )
+    bridged_share: float = field(
+        default=0.2,
+        metadata={
+            "help": "share of their confidence that matches from cells taken out so keep",
+            "ge": 0.0,
+            "le": 1.0,
+        },
+    )
     still: float = field(
         default=0.35, metadata={"help": "flow that counts as no motion, in pixels", "ge": 0.0}
     )

@@ -18,7 +18,8 @@ from droidw_plugins.features._calibration import (
     from_weights,
     is_blank,
 )
-from droidw_plugins.features._efficientnet import BLOCKS, CENTRES, load_trunk
+from droidw_plugins.features._efficientnet import CENTRES, FINE, load_trunk
+from droidw_plugins.features._movable import MovableClassifier
 from droidw_plugins.features.cnn import CnnOptions
 
 if TYPE_CHECKING:
@@ -54,10 +55,10 @@ class CnnFeatures:
     def __init__(self, options: CnnOptions, context: BuildContext) -> None:
         taps = tuple(options.taps)
         ascending = taps == tuple(sorted(set(taps)))
-        if not taps or not ascending or not 0 <= taps[0] <= taps[-1] < len(BLOCKS):
+        if not taps or not ascending or not 0 <= taps[0] <= taps[-1] < FINE:
             raise ConfigError(
                 f"features.options.taps: {list(taps)} is not an ascending list of blocks",
-                f"valid are blocks 0 to {len(BLOCKS) - 1}, e.g. features.options.taps=[2,4,7]",
+                f"valid are blocks 0 to {FINE - 1}, e.g. features.options.taps=[2,4,7]",
             )
         self._shares = tuple(options.tap_weights)
         if len(self._shares) != len(taps) or min(self._shares) <= 0:
@@ -70,6 +71,8 @@ class CnnFeatures:
             )
         path = Path(options.weights).expanduser() if options.weights else find_weights()
         self._trunk, self.weights_sha256 = load_trunk(path, taps, context.device)
+        self._path = path
+        self._classifier: MovableClassifier | None = None
         self._options = options
         self._mean = torch.tensor(_MEAN, device=context.device)[:, None, None]
         self._std = torch.tensor(_STD, device=context.device)[:, None, None]
@@ -116,6 +119,12 @@ class CnnFeatures:
                     options.length,
                 )
         return calibration(torch.cat(taps)).to(self.dtype)
+
+    def movable(self, image: Tensor, grid: Grid) -> Tensor:
+        """Probability [h,w] of animals, vehicles and clothes; see `MovableClassifier`."""
+        if self._classifier is None:
+            self._classifier = MovableClassifier(self._path, self._mean.device)
+        return self._classifier((image - self._mean) / self._std, grid)
 
     def state_dict(self) -> dict[str, Any]:
         """The calibration taken from a picture; empty before there was one."""

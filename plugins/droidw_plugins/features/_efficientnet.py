@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import pickle
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,16 @@ from torch.nn import functional as F
 
 from droidw.errors import MissingRequirementError
 
-__all__ = ["BLOCKS", "CENTRES", "BlockSpec", "ChannelStatistics", "Trunk", "load_trunk"]
+__all__ = [
+    "BLOCKS",
+    "CENTRES",
+    "FINE",
+    "BlockSpec",
+    "ChannelStatistics",
+    "Trunk",
+    "load_classifier",
+    "load_trunk",
+]
 
 _EPSILON = 1e-3  # of the batch normalisation the network was trained with
 
@@ -56,8 +65,15 @@ BLOCKS: tuple[BlockSpec, ...] = (
     BlockSpec(80, 112, 6, 5, 1),
     BlockSpec(112, 112, 6, 5, 1),
     BlockSpec(112, 112, 6, 5, 1),
+    BlockSpec(112, 192, 6, 5, 2),
+    BlockSpec(192, 192, 6, 5, 1),
+    BlockSpec(192, 192, 6, 5, 1),
+    BlockSpec(192, 192, 6, 5, 1),
+    BlockSpec(192, 320, 6, 3, 1),
 )
-"""The blocks up to stride 16; later ones are too coarse to compare pixels."""
+
+FINE = 11
+"""Blocks up to stride 16; later ones are too coarse to compare pixels."""
 
 
 CENTRES: dict[int, float] = {2: 0.7, 4: 2.4, 8: 3.7, 16: 10.0}
@@ -84,8 +100,8 @@ class ChannelStatistics:
 class _Conv:
     weight: Tensor
     bias: Tensor
-    stride: int
-    groups: int
+    stride: int = 1
+    groups: int = 1
 
     def __call__(self, x: Tensor) -> Tensor:
         pad = self.weight.shape[-1] // 2
@@ -117,7 +133,7 @@ class Trunk:
         self.strides: tuple[int, ...] = tuple(_stride_after(tap) for tap in taps)
         self.channels: tuple[int, ...] = tuple(BLOCKS[tap].outputs for tap in taps)
         self._device, self._dtype = device, dtype
-        self._stem = self._fold(state, "_conv_stem", "_bn0", 32, 3, 3, 2, 1)
+        self._stem = self.fold(state, "_conv_stem", "_bn0", 32, 3, 3, 2, 1)
         self._blocks: list[tuple[BlockSpec, tuple[_Conv, ...]]] = []
         self.statistics: list[ChannelStatistics] = []
         mean, variance = torch.zeros(0), torch.zeros(0)
@@ -127,12 +143,12 @@ class Trunk:
             convs = []
             if spec.expansion != 1:
                 convs.append(
-                    self._fold(
+                    self.fold(
                         state, f"{name}._expand_conv", f"{name}._bn0", wide, spec.inputs, 1, 1, 1
                     )
                 )
             convs.append(
-                self._fold(
+                self.fold(
                     state,
                     f"{name}._depthwise_conv",
                     f"{name}._bn1",
@@ -144,7 +160,7 @@ class Trunk:
                 )
             )
             convs.append(
-                self._fold(
+                self.fold(
                     state, f"{name}._project_conv", f"{name}._bn2", spec.outputs, wide, 1, 1, 1
                 )
             )
@@ -176,7 +192,7 @@ class Trunk:
                 found.append(x)
         return found
 
-    def _fold(
+    def fold(
         self,
         state: Mapping[str, Tensor],
         conv: str,
@@ -187,6 +203,7 @@ class Trunk:
         stride: int,
         groups: int,
     ) -> _Conv:
+        """A convolution with the batch normalisation behind it."""
         weight = _take(state, f"{conv}.weight", (outputs, inputs, kernel, kernel))
         scale = _take(state, f"{norm}.weight", (outputs,))
         shift = _take(state, f"{norm}.bias", (outputs,))
@@ -212,6 +229,31 @@ def load_trunk(
     Raises:
         MissingRequirementError: the file is missing, unreadable, or of another network.
     """
+    state, digest = _read(path)
+    return Trunk(state, taps, device, dtype), digest
+
+
+def load_classifier(
+    path: Path, tap: int, device: torch.device
+) -> tuple[Trunk, Callable[[Tensor], Tensor], _Conv]:
+    """Read a weights file as `load_trunk` does.
+
+    Returns:
+        The trunk up to block `tap`; what follows it, without its ReLU6, from [B,320,a,b] to
+        [B,1280,a,b]; and the last layer as a convolution, from there to [B,1000,a,b].
+    Raises:
+        MissingRequirementError: as `load_trunk`.
+    """
+    state, _ = _read(path)
+    trunk = Trunk(state, (tap,), device)
+    head = trunk.fold(state, "_conv_head", "_bn1", 1280, 320, 1, 1, 1)
+    weight = _take(state, "_fc.weight", (1000, 1280)).to(device)
+    classes = _Conv(weight[..., None, None], _take(state, "_fc.bias", (1000,)).to(device))
+    return trunk, head, classes
+
+
+def _read(path: Path) -> tuple[Mapping[str, Tensor], str]:
+    """The state dict in a weights file, and the sha256 of the file."""
     if not path.is_file():
         raise MissingRequirementError(
             f"features.options.weights: there is no file {path}",
@@ -228,7 +270,7 @@ def load_trunk(
         ) from error
     if not isinstance(state, Mapping):
         raise MissingRequirementError(f"{path} holds no state dict of EfficientNet-Lite0")
-    return Trunk(state, taps, device, dtype), digest
+    return state, digest
 
 
 def _take(state: Mapping[str, Tensor], key: str, shape: tuple[int, ...]) -> Tensor:

@@ -15,7 +15,10 @@ from droidw_plugins.uncertainty import _objective as objective
 from droidw_plugins.uncertainty._consistency import Consistency, Numbers
 from droidw_plugins.uncertainty.affine_softplus import AffineSoftplusOptions
 
-__all__ = ["AffineSoftplus", "affine", "affine_gradient"]
+__all__ = ["AffineSoftplus", "affine", "affine_fit", "affine_gradient"]
+
+# Share of the mean square of a feature that is added to all, when y is fitted to something.
+_RIDGE = 0.1
 
 
 def affine(rows: Tensor, theta: Tensor) -> Tensor:
@@ -31,6 +34,16 @@ def affine_gradient(weight: Tensor, rows: Tensor, bias: bool = True) -> Tensor:
     """
     slope = weight.flatten() @ rows.flatten(0, 1)
     return torch.cat([slope, (weight.sum() if bias else weight.new_zeros(()))[None]])
+
+
+def affine_fit(rows: Tensor, y: Tensor) -> Tensor:
+    """theta [C+1] whose map of rows [n,P,C] comes closest to y [n,P], by ridge regression."""
+    ones = rows.new_ones(rows.shape[0] * rows.shape[1], 1)
+    design = torch.cat([rows.flatten(0, 1), ones], dim=1)
+    square = design.T @ design / len(design)
+    square.diagonal().add_(_RIDGE * square.diagonal().mean())
+    theta: Tensor = torch.linalg.solve(square, design.T @ y.flatten() / len(design))
+    return theta
 
 
 @dataclass(frozen=True)
@@ -53,7 +66,7 @@ class AffineSoftplus:
         options: see `AffineSoftplusOptions`.
         context: device, and the seed of the random start of theta.
     Attributes:
-        fields: see `Consistency.fields`.
+        fields: see `Consistency.fields`. begins: whether `begin` is wanted.
     """
 
     def __init__(self, options: AffineSoftplusOptions, context: BuildContext) -> None:
@@ -64,7 +77,28 @@ class AffineSoftplus:
         # Drawn on the CPU, so that a seed means the same on every device.
         self._generator = torch.Generator().manual_seed(context.seed)
         self._theta: Tensor | None = None
+        self._home: Tensor | float = 0.0
         self._mapped: _Mapped | None = None
+        self.begins = options.movable_gain > 0
+
+    @torch.no_grad()
+    def begin(self, view: UncertaintyView, movable: Tensor) -> None:
+        """Start theta at what comes closest to `movable` [N,h,w], and from now on decay to that.
+
+        What a classifier says spreads over what surrounds a thing. The surroundings are seen
+        without the thing, too, so that the fit is sharper than what it is fitted to.
+        """
+        known = view.indices().frames
+        first, last = min(known), max(known) + 1
+        rows = self._objective.rows(view, first, last)
+        options = self._options
+        theta = options.movable_gain * affine_fit(rows, movable[first:last].flatten(1))
+        theta[-1] -= options.movable_gain * options.movable_at
+        self._theta = self._home = theta
+        self._mapped = None
+        u = objective.softplus(affine(rows, theta), options.softplus_offset)
+        u = u[view.frames - first].view(-1, *view.uncertainty.shape[1:])
+        self._objective.maps.write(view, u)
 
     @torch.no_grad()
     def append(self, view: UncertaintyView, index: int) -> None:
@@ -109,7 +143,7 @@ class AffineSoftplus:
         weight = torch.zeros_like(y)
         weight[place] = gradient * objective.softplus_slope(y[place], options.softplus_offset)
         step = affine_gradient(weight, rows, options.bias).mul_(self._objective.share(gradient))
-        theta = theta - options.lr * step - options.weight_decay * theta
+        theta = theta - options.lr * step - options.weight_decay * (theta - self._home)
         report, told = numbers.read(finite=torch.isfinite(theta).all(), norm=theta.norm())
         # A step that is not finite would poison the whole run; the report's energy shows it.
         if told["finite"]:
@@ -123,10 +157,13 @@ class AffineSoftplus:
     def state_dict(self) -> dict[str, Any]:
         """`theta` [C+1] (weights, then bias), or an empty dict before the first keyframe.
 
+        With `movable_gain` also `home` [C+1], where it started.
         Where similarities are calibrated, also what `MatchScale.state_dict` gives.
         """
-        scale = self._objective.scale.state_dict()
-        return {} if self._theta is None else {"theta": self._theta.clone(), **scale}
+        state = self._objective.scale.state_dict()
+        if isinstance(self._home, Tensor):
+            state["home"] = self._home.clone()
+        return {} if self._theta is None else {"theta": self._theta.clone(), **state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore `state_dict()`."""
@@ -134,6 +171,7 @@ class AffineSoftplus:
         self._objective.scale.load_state_dict(state)
         self._mapped = None
         self._theta = state["theta"].clone().to(self._device) if state else None
+        self._home = state["home"].clone().to(self._device) if "home" in state else 0.0
 
     def _parameters(self, view: UncertaintyView) -> Tensor:
         """theta, made at the first call: weights from N(0, 1/C) times `init_scale`, bias 0."""

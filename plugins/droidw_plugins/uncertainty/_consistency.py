@@ -156,6 +156,8 @@ class Consistency:
             pair.view(u.shape), u, counts, options.gamma_data, options.gamma_prior
         )
         numbers = Numbers(energy=energy, inside=pairs.inside, similar=pairs.similar)
+        if options.learn_majority > 0:
+            full = full * self.maps.believed
         return full[view.frames - pairs.first], numbers
 
     def share(self, gradient: Tensor) -> float:

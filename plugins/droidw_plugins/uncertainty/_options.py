@@ -87,6 +87,15 @@ class ObjectiveOptions:
             "lt": 1,
         },
     )
+    learn_majority: float = field(
+        default=0.0,
+        metadata={
+            "help": "share of the measured motion that counts which must agree with the poses "
+            "before anything is learned; steps are full from 0.2 more (0: always)",
+            "ge": 0,
+            "lt": 1,
+        },
+    )
     refresh: int = field(
         default=1,
         metadata={"help": "similarities are renewed at every n-th step on the same edges", "ge": 1},

@@ -87,10 +87,11 @@ class Publisher:
     """Writes maps to the store; what was learned stays apart where the two differ.
 
     Args:
-        options: `smooth` and those named `residual_...` are read.
+        options: `smooth`, `learn_majority` and those named `residual_...` are read.
     Attributes:
         fields: none by default; else the map [h,w] as learned, and the factor of `residual_factor`
             as it was last found.
+        believed: how far tracking may be learned from, in [0,1], with `learn_majority`.
     """
 
     def __init__(self, options: ObjectiveOptions) -> None:
@@ -100,6 +101,7 @@ class Publisher:
         if self._apart:
             fields = [StoreField(_LEARNED, ("h", "w")), StoreField(_FACTOR, ("h", "w"), fill=1.0)]
         self.fields: tuple[StoreField, ...] = tuple(fields)
+        self.believed: float | Tensor = 1.0
 
     def learned(self, view: UncertaintyView) -> Tensor:
         """The maps [N,h,w] that the objective is about."""
@@ -116,7 +118,7 @@ class Publisher:
     def weigh(self, view: UncertaintyView) -> None:
         """Renew the factors of the frames that edges of the view start from."""
         options = self._options
-        if options.residual_gain == 0 or view.ii.numel() == 0:
+        if max(options.residual_gain, options.learn_majority) == 0 or view.ii.numel() == 0:
             return
         known = view.indices().ii
         first, last = min(known), max(known) + 1
@@ -126,6 +128,12 @@ class Publisher:
         residual = torch.linalg.vector_norm(apart, dim=1)
         confidence = view.confidence[..., :2].mean(-1) * valid.view(shape)
         scale = options.residual_scale
+        if options.learn_majority > 0:
+            gates = 1.0 if view.gate is None else view.gate(view.uncertainty)[view.ii]
+            least = options.learn_majority
+            self.believed = agreeing_majority(residual, confidence * gates, scale, least)
+        if options.residual_gain == 0:
+            return
         believed = agreeing_majority(residual, confidence, scale, options.residual_majority)
         factor = residual_factor(
             residual,

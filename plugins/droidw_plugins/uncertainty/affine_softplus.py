@@ -21,7 +21,12 @@ class AffineSoftplusOptions(ObjectiveOptions):
     lr: float = field(default=0.1, metadata={"help": "step of gradient descent", "ge": 0})
     weight_decay: float = field(
         default=0.002,
-        metadata={"help": "share of the parameters that is lost per step", "ge": 0, "lt": 1},
+        metadata={
+            "help": "share of the parameters, or of the way from where they started with "
+            "movable_gain, that is lost per step",
+            "ge": 0,
+            "lt": 1,
+        },
     )
     softplus_offset: float = field(
         default=0.1,
@@ -35,6 +40,18 @@ class AffineSoftplusOptions(ObjectiveOptions):
             "the same u, below the gate",
             "ge": 0,
         },
+    )
+    movable_gain: float = field(
+        default=0.0,
+        metadata={
+            "help": "parameters start, and decay, at a fit of y = gain (p - movable_at); p is "
+            "how likely features find what can move by itself (0: not asked)",
+            "ge": 0,
+        },
+    )
+    movable_at: float = field(
+        default=0.55,
+        metadata={"help": "p at which y starts at 0", "ge": 0, "le": 1},
     )
 
 

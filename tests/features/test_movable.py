@@ -1,0 +1,48 @@
+"""What the classifier behind `cnn` says of what can move."""
+
+from __future__ import annotations
+
+import torch
+from torch.nn import functional as F
+
+from droidw.geometry.camera import Grid
+from droidw.plugin.component import BuildContext
+from droidw_plugins.features._cnn import CnnFeatures, find_weights
+from droidw_plugins.features._efficientnet import BLOCKS, load_classifier
+from droidw_plugins.features._movable import MOVABLE
+from droidw_plugins.features.cnn import CnnOptions
+
+CPU = torch.device("cpu")
+
+
+def test_last_layers_are_those_of_the_weights() -> None:
+    _, head, classes = load_classifier(find_weights(), len(BLOCKS) - 1, CPU)
+    state = torch.load(find_weights(), weights_only=True)
+    x = torch.randn(2, 320, 3, 4, generator=torch.Generator().manual_seed(0))
+    seen = F.batch_norm(
+        F.conv2d(x, state["_conv_head.weight"]),
+        state["_bn1.running_mean"], state["_bn1.running_var"],
+        state["_bn1.weight"], state["_bn1.bias"], eps=1e-3,
+    )  # fmt: skip
+    assert torch.allclose(head(x), seen, atol=1e-4)
+    logits = F.linear(seen.movedim(1, -1), state["_fc.weight"], state["_fc.bias"])
+    assert torch.allclose(classes(seen), logits.movedim(-1, 1), atol=1e-3)
+
+
+def test_classes_are_each_named_once() -> None:
+    assert len(set(MOVABLE)) == len(MOVABLE)
+    assert min(MOVABLE) == 0 and max(MOVABLE) < 1000
+    # Arabian camel, sports car, jersey move; desk, sliding door, lakeside do not.
+    assert {354, 817, 610} <= set(MOVABLE) and not {526, 799, 975} & set(MOVABLE)
+
+
+def test_a_probability_for_each_cell_of_any_grid() -> None:
+    extractor = CnnFeatures(CnnOptions(), BuildContext(CPU))
+    image = torch.rand(3, 100, 136, generator=torch.Generator().manual_seed(1))
+    for grid in (Grid(12, 17, 8, 3.5), Grid(25, 34, 4, 1.5)):
+        p = extractor.movable(image, grid)
+        assert p.shape == (grid.height, grid.width)
+        assert 0 <= float(p.min()) < float(p.max()) <= 1
+        assert torch.equal(p, extractor.movable(image, grid))
+    tiny = extractor.movable(image[:, :24, :24], Grid(3, 3, 8, 3.5))
+    assert bool(torch.isfinite(tiny).all())

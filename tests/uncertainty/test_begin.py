@@ -1,0 +1,98 @@
+"""Where `affine-softplus` begins with what can move, and when it learns."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from droidw.interfaces.uncertainty import UncertaintyView
+from droidw.plugin.component import BuildContext
+from droidw.solve.weights import gate
+from droidw_plugins.uncertainty._affine import AffineSoftplus, affine_fit
+from droidw_plugins.uncertainty.affine_softplus import AffineSoftplusOptions
+
+Start = Callable[..., UncertaintyView]
+
+
+def _model(**options: float) -> AffineSoftplus:
+    given = {"init_scale": 0.0, **options}
+    return AffineSoftplus(
+        AffineSoftplusOptions(**given),  # type: ignore[arg-type]
+        BuildContext(torch.device("cpu")),
+    )
+
+
+def _likely(view: UncertaintyView) -> torch.Tensor:
+    """0.2 on the left and 0.8 in the three columns that change."""
+    movable = torch.full_like(view.uncertainty, 0.2)
+    movable[:, :, 4:] = 0.8
+    return movable
+
+
+def test_fit_is_ridge_regression() -> None:
+    draw = torch.Generator().manual_seed(0)
+    rows = torch.randn(2, 50, 3, generator=draw, dtype=torch.float64)
+    y = torch.randn(2, 50, generator=draw, dtype=torch.float64)
+    theta = affine_fit(rows, y).requires_grad_()
+    found = (rows @ theta[:-1] + theta[-1] - y).square().mean()
+    square = (rows.square().mean((0, 1)).sum() + 1) / 4
+    (slope,) = torch.autograd.grad(found + 0.1 * square * theta.square().sum(), theta)
+    assert float(slope.abs().max()) < 1e-12
+
+
+def test_begins_with_what_can_move(started: Start) -> None:
+    model = _model(movable_gain=8.0)
+    view = started(model)
+    assert model.begins and not _model().begins
+    model.begin(view, _likely(view))
+    still, moves = view.uncertainty[:, :, :4], view.uncertainty[:, :, 4:]
+    assert float(still.max()) < 0.8 < float(moves.mean())
+    assert float(gate(still).min()) == 1.0
+
+
+def test_decays_to_where_it_began(started: Start) -> None:
+    # Without a loss only weight decay acts: to the start with `begin`, else to zero.
+    model = _model(movable_gain=8.0, gamma_data=0.0, gamma_prior=0.0, weight_decay=0.5)
+    view = started(model)
+    model.begin(view, _likely(view))
+    home = model.state_dict()["home"]
+    model.load_state_dict({**model.state_dict(), "theta": torch.zeros_like(home)})
+    for _ in range(30):
+        model.update(view)
+    assert torch.allclose(model.state_dict()["theta"], home, atol=1e-5)
+
+
+def test_a_restored_model_knows_where_it_began(started: Start) -> None:
+    model = _model(movable_gain=8.0, weight_decay=0.1)
+    view = started(model)
+    model.begin(view, _likely(view))
+    other = _model(movable_gain=8.0, weight_decay=0.1)
+    other.load_state_dict(model.state_dict())
+    copied = dataclasses.replace(
+        view,
+        uncertainty=view.uncertainty.clone(),
+        fields={k: v.clone() for k, v in view.fields.items()},
+    )
+    model.update(view)
+    other.update(copied)
+    assert torch.equal(model.state_dict()["theta"], other.state_dict()["theta"])
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_learns_where_most_of_what_counts_agrees(started: Start, lost: bool) -> None:
+    always, held = _model(lr=0.3), _model(lr=0.3, learn_majority=0.6)
+    found = []
+    for model in (always, held):
+        view = started(model)
+        y, x = torch.meshgrid(torch.arange(6.0), torch.arange(7.0), indexing="ij")
+        target = torch.stack([x, y], -1).expand(len(view.ii), -1, -1, -1).clone()
+        # The columns that change are measured elsewhere, and the rest too, where all is lost.
+        target[:, :, 0 if lost else 4 :] += 2.0
+        view.uncertainty[:, :, 4:] = 2.0
+        model.update(dataclasses.replace(view, target=target, gate=gate))
+        found.append(model.state_dict()["theta"])
+    assert float(found[0].abs().max()) > 0
+    assert torch.equal(found[1], torch.zeros_like(found[1]) if lost else found[0])
