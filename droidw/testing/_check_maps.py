@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -75,6 +76,26 @@ def feature_extractor(subject: Subject) -> None:
                 same(features, other),
                 f"two extractors of one seed give different features for {what}",
             )
+            if hasattr(part, "movable"):
+                _movable(subject, part, image, grid, f"{what}, stride {stride},")
+
+
+def _movable(subject: Subject, part: Any, image: Tensor, grid: Grid, what: str) -> None:
+    before = snapshot(image)
+    with subject.calling(f"movable on {what}"):
+        found, again = part.movable(image, grid), part.movable(image, grid)
+    subject.tensor(f"the result of movable on {what}", found, (grid.height, grid.width))
+    subject.unchanged(f"the image given to movable ({what})", before, image)
+    subject.expect(
+        "range",
+        bool(((found >= 0) & (found <= 1)).all()),
+        f"movable is no probability somewhere on {what}",
+    )
+    subject.expect(
+        "deterministic",
+        same(found, again),
+        f"movable says something else of {what} when asked again",
+    )
 
 
 def depth_prior(subject: Subject) -> None:

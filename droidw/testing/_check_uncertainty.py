@@ -40,7 +40,32 @@ def uncertainty_model(subject: Subject) -> None:
             same(maps[0], maps[1]),
             f"two models of one seed give different maps {label}",
         )
+    if getattr(part, "begins", False):
+        _begin(subject)
     _state(subject)
+
+
+def _begin(subject: Subject) -> None:
+    """A model that begins with what can move writes the maps that it is asked for."""
+    part = subject.build(seed=3)
+    view = _view(subject, part, 24, torch.float32)
+    for index in range(_N):
+        part.append(_without_edges(view), index)
+    movable = torch.linspace(0, 1, _W, device=subject.device).expand(_N, _H, _W).contiguous()
+    before, given = snapshot(view), snapshot(movable)
+    with subject.calling("begin"):
+        part.begin(_without_edges(view), movable)
+    _inputs_kept(subject, before, view, "begin")
+    subject.unchanged("what can move, given to begin", given, movable)
+    _maps(subject, view, "after begin")
+    subject.expect(
+        "only-asked",
+        same(before.uncertainty[3], view.uncertainty[3]),
+        "begin changed the map of a keyframe that is not in `frames`",
+    )
+    with subject.calling("update after begin"):
+        part.update(view)
+    _maps(subject, view, "after begin and an update")
 
 
 def _fields(subject: Subject, part: Any) -> None:

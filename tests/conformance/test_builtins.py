@@ -75,6 +75,12 @@ def test_part_keeps_the_contract_of_its_kind(entry, device, tmp_path):
     check(entry.kind, entry.component, device, options)
 
 
+def test_a_model_that_begins_with_what_can_move_keeps_the_contract(device):
+    [entry] = [e for e in ENTRIES if e.component.name == "affine-softplus"]
+    options = entry.component.options(movable_gain=8.0, learn_majority=0.6, smooth=1)
+    check("uncertainty", entry.component, device, options)
+
+
 @pytest.mark.parametrize("name", READERS)
 def test_reader_keeps_the_contract(name, footage):
     component = READERS[name]

@@ -56,11 +56,12 @@ class FlowSession:
         return EdgeUpdate(upload(target, device), upload(confidence, device))
 
     def _blind(self, request: EdgeRequest) -> list[int]:
-        """Rows searched before geometry could be believed, once uncertainty can be, too.
+        """Rows searched before geometry could be believed, once it and uncertainty can be.
 
-        Without it a search that starts from poses which follow what moves would only confirm them.
+        Without uncertainty a search that starts from poses which follow what moves would only
+        confirm them.
         """
-        if request.gates is None:
+        if request.gates is None or not request.informed:
             return []
         known = [self._edges.get(edge_id) for edge_id in request.ids]
         return [row for row, edge in enumerate(known) if edge is not None and edge.blind]
