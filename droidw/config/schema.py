@@ -123,6 +123,13 @@ class FrontendConfig:
     keyframe_threshold: float = opt(
         0.8, "distance below which the newest keyframe is dropped", ge=0
     )
+    keep_below: float = opt(
+        0.6,
+        "share of the measured motion that must agree with the newest pose for its keyframe to be "
+        "dropped (0: not asked)",
+        ge=0,
+        le=1,
+    )
     threshold: float = opt(8.0, "largest frame distance of a proximity edge, in cells", gt=0)
     window: int = opt(25, "keyframes searched for proximity edges", ge=2)
     radius: int = opt(2, "neighbours always linked", ge=1)

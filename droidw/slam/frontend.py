@@ -13,6 +13,7 @@ from droidw.geometry.se3 import exp, inv, log, mul
 from droidw.geometry.transfer import on_device, upload
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import frontend_edges, neighbour_edges
+from droidw.slam.doubt import agreeing_share
 from droidw.slam.locate import carry_depth, locate
 from droidw.slam.starts import mirrored, plane_starts
 
@@ -209,7 +210,19 @@ class Frontend:
         if self._drops >= _MOST_DROPS:
             return None
         near = self._between(count - 2, count - 1) < options.keyframe_threshold
-        return count - 1 if near else None
+        return count - 1 if near and not self._doubtful() else None
+
+    def _doubtful(self) -> bool:
+        """Whether too little of what the newest keyframe measured agrees with its pose.
+
+        What such a pose calls near may be far, and dropped keyframes make the next search harder.
+        """
+        least = self.options.keep_below
+        if least == 0:
+            return False
+        graph, last = self.graph, len(self.store) - 1
+        rows = [r for r in graph.select() if last in (graph.ii[r], graph.jj[r])]
+        return agreeing_share(self.store, graph, rows, self.optimiser.gates()) < least
 
     def _between(self, i: int, j: int) -> float:
         """Frame distance of two keyframes."""

@@ -15,7 +15,7 @@ PAPER = {
     "frontend.keyframe_threshold": 3.0, "frontend.redundant": "newest",
     "frontend.threshold": 16.0, "frontend.window": 25, "frontend.radius": 2, "frontend.nms": 1,
     "frontend.max_factors": 75, "frontend.max_age": 50, "frontend.predict": "hold",
-    "frontend.starts": False,
+    "frontend.starts": False, "frontend.keep_below": 0.0,
     "backend.passes": [7, 12], "backend.beta": 0.75, "backend.threshold": 25.0,
     "backend.radius": 1, "backend.nms": 5, "backend.nms_shape": "square",
     "backend.normalize": False, "backend.factors_per_keyframe": 6,

@@ -1,0 +1,75 @@
+"""Whether tracking holds, and what the frontend does where it may not."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.config.schema import FrontendConfig
+from droidw.geometry.camera import Grid
+from droidw.geometry.projective import reproject
+from droidw.graph.factors import FactorGraph
+from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.slam.doubt import agreeing_share
+from droidw.slam.frontend import Frontend
+
+H, W = 6, 8
+
+
+@pytest.fixture
+def measured():
+    """Two keyframes and an edge each way, measured where poses and depths put it."""
+    store = KeyframeStore(Grid(H, W, 8, 3.5), torch.tensor([60.0, 60.0, 31.5, 23.5]))
+    for k in range(2):
+        info = KeyframeInfo(k, k / 10, "", np.zeros((48, 64, 3), np.uint8), None)
+        store.append(info, T_cw=torch.tensor([0.1 * k, 0, 0, 0, 0, 0, 1]))
+    graph = FactorGraph(H, W)
+    graph.add([(0, 1), (1, 0)])
+    place, _ = reproject(store.T_cw, store.disps, store.intrinsics, *graph.index([0, 1]))
+    graph.record([0, 1], place, torch.ones(2, H, W, 3))
+    return store, graph, torch.ones(2, H, W)
+
+
+def test_all_agrees_with_the_poses_it_was_made_from(measured):
+    store, graph, gates = measured
+    assert agreeing_share(store, graph, [0, 1], gates) == pytest.approx(1.0)
+
+
+def test_share_is_that_of_confidence_times_gate(measured):
+    store, graph, gates = measured
+    target, confidence = graph.target.clone(), graph.confidence.clone()
+    target[:, :, W // 2 :] += torch.tensor([0.2, 0.0])  # agrees by half
+    graph.record([0, 1], target, confidence)
+    assert agreeing_share(store, graph, [0, 1], gates) == pytest.approx(0.75)
+    confidence[:, :, W // 2 :] *= 0.5
+    graph.record([0, 1], target, confidence)
+    assert agreeing_share(store, graph, [0, 1], gates) == pytest.approx((1 + 0.25) / 1.5)
+    gates[:, :, : W // 2] = 0.0
+    assert agreeing_share(store, graph, [0, 1], gates) == pytest.approx(0.5)
+
+
+def test_what_is_broken_or_not_there_does_not_count(measured):
+    store, graph, gates = measured
+    target, confidence = graph.target.clone(), graph.confidence.clone()
+    target[0, 0, 0] = float("nan")
+    confidence[1, 0, 0] = float("nan")
+    graph.record([0, 1], target, confidence)
+    share = agreeing_share(store, graph, [0, 1], gates)
+    assert share == pytest.approx((2 * H * W - 2) / (2 * H * W - 1))
+    assert agreeing_share(store, graph, [0, 1], 0 * gates) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("off", "keep_below", "dropped"), [(0.0, 0.6, 1), (2.0, 0.6, None), (2.0, 0.0, 1)]
+)
+def test_a_near_keyframe_is_dropped_only_where_tracking_holds(measured, off, keep_below, dropped):
+    store, graph, gates = measured
+    graph.record([0, 1], graph.target + off, graph.confidence.clone())
+    frontend = Frontend.__new__(Frontend)
+    frontend.store, frontend.graph, frontend._drops = store, graph, 0
+    frontend.options = FrontendConfig(keyframe_threshold=100.0, keep_below=keep_below)
+    frontend.optimiser = SimpleNamespace(gates=lambda: gates)
+    assert frontend._redundant() == dropped
