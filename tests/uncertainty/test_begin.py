@@ -83,10 +83,11 @@ def test_a_restored_model_knows_where_it_began(started: Start) -> None:
 
 @pytest.mark.parametrize("lost", [True, False])
 def test_learns_where_most_of_what_counts_agrees(started: Start, lost: bool) -> None:
-    always, held = _model(lr=0.3), _model(lr=0.3, learn_majority=0.6)
+    always, held = (_model(lr=0.3, movable_gain=8.0, learn_majority=m) for m in (0.0, 0.6))
     found = []
     for model in (always, held):
         view = started(model)
+        model.begin(view, _likely(view))
         y, x = torch.meshgrid(torch.arange(6.0), torch.arange(7.0), indexing="ij")
         target = torch.stack([x, y], -1).expand(len(view.ii), -1, -1, -1).clone()
         # The columns that change are measured elsewhere, and the rest too, where all is lost.
@@ -94,5 +95,15 @@ def test_learns_where_most_of_what_counts_agrees(started: Start, lost: bool) -> 
         view.uncertainty[:, :, 4:] = 2.0
         model.update(dataclasses.replace(view, target=target, gate=gate))
         found.append(model.state_dict()["theta"])
-    assert float(found[0].abs().max()) > 0
-    assert torch.equal(found[1], torch.zeros_like(found[1]) if lost else found[0])
+    home = held.state_dict()["home"]
+    assert float((found[0] - home).abs().max()) > 1e-4
+    assert torch.equal(found[1], home if lost else found[0])
+
+
+def test_a_model_that_began_with_nothing_learns_always(started: Start) -> None:
+    found = []
+    for model in (_model(lr=0.3), _model(lr=0.3, learn_majority=0.6)):
+        view = started(model)
+        model.update(dataclasses.replace(view, target=view.target + 50.0, gate=gate))
+        found.append(model.state_dict()["theta"])
+    assert torch.equal(*found) and float(found[0].abs().max()) > 0

@@ -95,6 +95,7 @@ class AffineSoftplus:
         theta = options.movable_gain * affine_fit(rows, movable[first:last].flatten(1))
         theta[-1] -= options.movable_gain * options.movable_at
         self._theta = self._home = theta
+        self._objective.maps.begun = True
         self._mapped = None
         u = objective.softplus(affine(rows, theta), options.softplus_offset)
         u = u[view.frames - first].view(-1, *view.uncertainty.shape[1:])
@@ -172,6 +173,7 @@ class AffineSoftplus:
         self._mapped = None
         self._theta = state["theta"].clone().to(self._device) if state else None
         self._home = state["home"].clone().to(self._device) if "home" in state else 0.0
+        self._objective.maps.begun = "home" in state
 
     def _parameters(self, view: UncertaintyView) -> Tensor:
         """theta, made at the first call: weights from N(0, 1/C) times `init_scale`, bias 0."""

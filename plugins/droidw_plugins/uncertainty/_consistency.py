@@ -156,7 +156,7 @@ class Consistency:
             pair.view(u.shape), u, counts, options.gamma_data, options.gamma_prior
         )
         numbers = Numbers(energy=energy, inside=pairs.inside, similar=pairs.similar)
-        if options.learn_majority > 0:
+        if self.maps.begun:
             full = full * self.maps.believed
         return full[view.frames - pairs.first], numbers
 

@@ -90,8 +90,9 @@ class ObjectiveOptions:
     learn_majority: float = field(
         default=0.0,
         metadata={
-            "help": "share of the measured motion that counts which must agree with the poses "
-            "before anything is learned; steps are full from 0.2 more (0: always)",
+            "help": "where the model began with what can move: share of the measured motion that "
+            "counts which must agree with the poses before anything is learned; steps are full "
+            "from 0.2 more (0: always)",
             "ge": 0,
             "lt": 1,
         },

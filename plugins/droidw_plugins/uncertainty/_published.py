@@ -91,7 +91,9 @@ class Publisher:
     Attributes:
         fields: none by default; else the map [h,w] as learned, and the factor of `residual_factor`
             as it was last found.
-        believed: how far tracking may be learned from, in [0,1], with `learn_majority`.
+        begun: whether the maps began with something that is worth keeping.
+        believed: how far tracking may be learned from, in [0,1], with `learn_majority` and if
+            `begun`.
     """
 
     def __init__(self, options: ObjectiveOptions) -> None:
@@ -101,6 +103,7 @@ class Publisher:
         if self._apart:
             fields = [StoreField(_LEARNED, ("h", "w")), StoreField(_FACTOR, ("h", "w"), fill=1.0)]
         self.fields: tuple[StoreField, ...] = tuple(fields)
+        self.begun = False
         self.believed: float | Tensor = 1.0
 
     def learned(self, view: UncertaintyView) -> Tensor:
@@ -118,7 +121,8 @@ class Publisher:
     def weigh(self, view: UncertaintyView) -> None:
         """Renew the factors of the frames that edges of the view start from."""
         options = self._options
-        if max(options.residual_gain, options.learn_majority) == 0 or view.ii.numel() == 0:
+        least = options.learn_majority if self.begun else 0.0
+        if max(options.residual_gain, least) == 0 or view.ii.numel() == 0:
             return
         known = view.indices().ii
         first, last = min(known), max(known) + 1
@@ -128,9 +132,8 @@ class Publisher:
         residual = torch.linalg.vector_norm(apart, dim=1)
         confidence = view.confidence[..., :2].mean(-1) * valid.view(shape)
         scale = options.residual_scale
-        if options.learn_majority > 0:
+        if least > 0:
             gates = 1.0 if view.gate is None else view.gate(view.uncertainty)[view.ii]
-            least = options.learn_majority
             self.believed = agreeing_majority(residual, confidence * gates, scale, least)
         if options.residual_gain == 0:
             return
