@@ -142,8 +142,10 @@ def test_information_is_the_sum_of_both_directions():
     blank = np.zeros(shape, np.uint8)
     payload = FlowFrame(0, blank, power, power, normal, power, STRIDE)
     trusted = g.uniform(0, 1, (2, *shape)).astype(np.float32)
-    found = information(payload, *trusted, texture=2.0)
-    share = trusted * np.moveaxis(power / (power + 4), -1, 0)
+    options = flow.COMPONENT.options(texture=2.0, edge_leak=0.5)
+    found = information(payload, *trusted, options)
+    level = 4 + 0.5 * (power[..., :1] - power[..., 1:]) * np.array([0, 1])
+    share = trusted * np.moveaxis(power / (power + level), -1, 0)
     n, t = normal[..., None], np.stack([-normal[..., 1], normal[..., 0]], -1)[..., None]
     expected = share[0][..., None, None] * n * np.swapaxes(n, -1, -2)
     expected = expected + share[1][..., None, None] * t * np.swapaxes(t, -1, -2)
@@ -151,6 +153,19 @@ def test_information_is_the_sum_of_both_directions():
         np.testing.assert_allclose(found[..., k], expected[..., a, b], atol=1e-6)
     assert found.dtype == np.float32
     assert is_information(torch.from_numpy(found).double())
+
+
+def test_a_bent_line_is_hardly_known_along_itself(measured):
+    """An arc seen through one cell has some power along itself, and still lets a match slip."""
+    rows, cols = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    radius = np.hypot(rows + 20, cols - WIDTH / 2)
+    arcs = (128 + 60 * np.sin(2 * np.pi * radius / 24)).astype(np.float32)
+    below = (slice(4, -4), slice(WIDTH // STRIDE // 2 - 1, WIDTH // STRIDE // 2 + 1))
+    trusting, strict = (
+        along(measured(arcs, arcs, edge_leak=leak)[1], 0)[below] for leak in (0.0, 0.3)
+    )
+    assert float(trusting.mean()) > 0.05
+    assert float(strict.mean()) < 0.2 * float(trusting.mean())
 
 
 def test_no_edges_have_three_channels_too(operator):

@@ -182,7 +182,7 @@ class FlowCorrespondence:
     def one_way(self, a: FlowFrame, b: FlowFrame) -> Edge:
         """Edge a -> b without the way back."""
         moved, agrees = self._one_way(a, b, self._search)
-        confidence = information(a, agrees, agrees, self.options.texture)
+        confidence = information(a, agrees, agrees, self.options)
         target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, None)
 
@@ -267,7 +267,7 @@ class FlowCorrespondence:
         there = a.centres + moved
         back = sample(ba, there, outside=1e4)
         agreed = trust(moved + back, a.normal, self.options)
-        confidence = information(a, *agreed, self.options.texture)
+        confidence = information(a, *agreed, self.options)
         target = ((there - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, started)
 

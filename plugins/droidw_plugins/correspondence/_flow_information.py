@@ -82,21 +82,24 @@ def trust(apart: Array, normal: Array, options: FlowOptions) -> tuple[Array, Arr
     return first.astype(np.float32), second.astype(np.float32)
 
 
-def information(frame: FlowFrame, across: Array, along: Array, texture: float) -> Array:
+def information(frame: FlowFrame, across: Array, along: Array, options: FlowOptions) -> Array:
     """Information (xx, yy, xy) of matches from a frame, [h,w,3] float32.
 
     Along each eigenvector of the structure tensor its eigenvalue says how much of the trust counts:
-    power / (power + texture^2).
+    power / (power + texture^2). What the second has to exceed grows by `edge_leak` times the
+    difference of the two: a bend, a blurred end or noise of a strong line gives it some power along
+    itself, by which a match that slips along the line would count as known.
 
     Args:
         across, along: [h,w] in [0,1], trust along the first and the second eigenvector.
-        texture: grey levels per pixel; 0: the picture is not asked.
+        options: with `texture` 0 the picture is not asked.
     """
     first, second = across, along
-    if texture > 0:
-        level = np.float32(texture**2)
-        first = across * frame.power[..., 0] / (frame.power[..., 0] + level)
-        second = along * frame.power[..., 1] / (frame.power[..., 1] + level)
+    if options.texture > 0:
+        strong, weak = frame.power[..., 0], frame.power[..., 1]
+        level = np.float32(options.texture**2)
+        first = across * strong / (strong + level)
+        second = along * weak / (weak + level + np.float32(options.edge_leak) * (strong - weak))
     x, y = frame.normal[..., 0], frame.normal[..., 1]
     matrix = np.stack(
         [first * x * x + second * y * y, first * y * y + second * x * x, (first - second) * x * y],

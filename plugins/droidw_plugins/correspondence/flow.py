@@ -58,6 +58,14 @@ class FlowOptions:
             "ge": 0.0,
         },
     )
+    edge_leak: float = field(
+        default=0.3,
+        metadata={
+            "help": "how much of an edge's power its power along itself has to exceed: bends and blur "
+            "of a line do not hold a match that slips along it",
+            "ge": 0.0,
+        },
+    )
     restart: float = field(
         default=2.0,
         metadata={
