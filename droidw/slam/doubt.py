@@ -8,24 +8,24 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from droidw.geometry.projective import reproject
+from droidw.solve.weights import agreeing_share
 
 if TYPE_CHECKING:
     from droidw.graph.factors import FactorGraph
     from droidw.graph.store import KeyframeStore
 
-__all__ = ["agreeing_share"]
+__all__ = ["explained_share"]
 
 # Distance of measured and predicted place, in cells, at which they agree by half.
 _SCALE = 0.2
 
 
-def agreeing_share(
+def explained_share(
     store: KeyframeStore, graph: FactorGraph, rows: list[int], gates: Tensor
 ) -> float:
     """Share in [0,1] of what these edges measured that agrees with poses and depths.
 
-    It is the mean of `1 / (1 + (r / 0.2)^2)`, r in cells, weighted by confidence and gate; 1 where
-    nothing was measured.
+    Weighted by confidence and gate; 1 where nothing was measured.
 
     Args:
         rows: of the graph.
@@ -33,9 +33,6 @@ def agreeing_share(
     """
     ii, jj = graph.index(rows)
     place, valid = reproject(store.T_cw, store.disps, store.intrinsics, ii, jj)
-    target, confidence = graph.target[rows], graph.confidence[rows]
-    weight = (confidence[..., :2].mean(-1) * gates[ii] * valid).nan_to_num(0.0)
-    apart = vector_norm(target - place, dim=-1).nan_to_num(1e3)
-    agreeing = (weight / (1.0 + (apart / _SCALE).square())).sum()
-    total = weight.sum()
-    return float(agreeing / total) if float(total) > 0 else 1.0
+    weight = graph.confidence[rows][..., :2].mean(-1) * gates[ii] * valid
+    apart = vector_norm(graph.target[rows] - place, dim=-1)
+    return float(agreeing_share(apart, weight, _SCALE, nothing=1.0))

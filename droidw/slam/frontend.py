@@ -13,7 +13,7 @@ from droidw.geometry.se3 import exp, inv, log, mul
 from droidw.geometry.transfer import on_device, upload
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import frontend_edges, neighbour_edges
-from droidw.slam.doubt import agreeing_share
+from droidw.slam.doubt import explained_share
 from droidw.slam.locate import carry_depth, locate
 from droidw.slam.starts import mirrored, plane_starts
 
@@ -222,7 +222,7 @@ class Frontend:
             return False
         graph, last = self.graph, len(self.store) - 1
         rows = [r for r in graph.select() if last in (graph.ii[r], graph.jj[r])]
-        return agreeing_share(self.store, graph, rows, self.optimiser.gates()) < least
+        return explained_share(self.store, graph, rows, self.optimiser.gates()) < least
 
     def _between(self, i: int, j: int) -> float:
         """Frame distance of two keyframes."""

@@ -1,5 +1,7 @@
 """From confidence and uncertainty to the weights of bundle adjustment (REFERENCE 3.1).
 
+And what they weigh: how much of the measured motion agrees with the poses.
+
 Bundle adjustment never sees an uncertainty: it gets `confidence x gate x validity`.
 """
 
@@ -15,7 +17,7 @@ from droidw.geometry.transfer import on_device
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["GateKind", "gate", "residual_weights"]
+__all__ = ["GateKind", "agreeing_share", "gate", "residual_weights"]
 
 GateKind = Literal["rational", "inverse", "none"]
 
@@ -90,6 +92,24 @@ def residual_weights(
     if valid is not None:
         weight = weight * valid[..., None].to(weight.dtype)
     return weight
+
+
+def agreeing_share(residual: Tensor, weight: Tensor, scale: float, nothing: float = 0.0) -> Tensor:
+    """Mean of `1 / (1 + (r / scale)^2)`, in [0,1]: how much of what was measured agrees.
+
+    Args:
+        residual: distance of measured and predicted place, cells. weight: >= 0, the same shape;
+            where either is not finite, nothing was measured.
+        scale: distance at which a measurement agrees by half, cells.
+        nothing: the answer where all weights are 0.
+    Returns:
+        A scalar on the device.
+    """
+    known = torch.isfinite(residual) & torch.isfinite(weight)
+    weight = torch.where(known, weight, 0.0)
+    apart = torch.where(known, residual, 0.0)
+    agreeing, total = (weight / (1.0 + (apart / scale).square_())).sum(), weight.sum()
+    return torch.where(total > 0, agreeing / total.clamp_min(1e-6), nothing)
 
 
 def _gate_at(gates: Tensor, target: Tensor) -> Tensor:

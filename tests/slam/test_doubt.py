@@ -13,7 +13,7 @@ from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
 from droidw.graph.factors import FactorGraph
 from droidw.graph.store import KeyframeInfo, KeyframeStore
-from droidw.slam.doubt import agreeing_share
+from droidw.slam.doubt import explained_share
 from droidw.slam.frontend import Frontend
 
 H, W = 6, 8
@@ -35,7 +35,7 @@ def measured():
 
 def test_all_agrees_with_the_poses_it_was_made_from(measured):
     store, graph, gates = measured
-    assert agreeing_share(store, graph, [0, 1], gates) == pytest.approx(1.0)
+    assert explained_share(store, graph, [0, 1], gates) == pytest.approx(1.0)
 
 
 def test_share_is_that_of_confidence_times_gate(measured):
@@ -43,12 +43,12 @@ def test_share_is_that_of_confidence_times_gate(measured):
     target, confidence = graph.target.clone(), graph.confidence.clone()
     target[:, :, W // 2 :] += torch.tensor([0.2, 0.0])  # agrees by half
     graph.record([0, 1], target, confidence)
-    assert agreeing_share(store, graph, [0, 1], gates) == pytest.approx(0.75)
+    assert explained_share(store, graph, [0, 1], gates) == pytest.approx(0.75)
     confidence[:, :, W // 2 :] *= 0.5
     graph.record([0, 1], target, confidence)
-    assert agreeing_share(store, graph, [0, 1], gates) == pytest.approx((1 + 0.25) / 1.5)
+    assert explained_share(store, graph, [0, 1], gates) == pytest.approx((1 + 0.25) / 1.5)
     gates[:, :, : W // 2] = 0.0
-    assert agreeing_share(store, graph, [0, 1], gates) == pytest.approx(0.5)
+    assert explained_share(store, graph, [0, 1], gates) == pytest.approx(0.5)
 
 
 def test_what_is_broken_or_not_there_does_not_count(measured):
@@ -57,9 +57,11 @@ def test_what_is_broken_or_not_there_does_not_count(measured):
     target[0, 0, 0] = float("nan")
     confidence[1, 0, 0] = float("nan")
     graph.record([0, 1], target, confidence)
-    share = agreeing_share(store, graph, [0, 1], gates)
-    assert share == pytest.approx((2 * H * W - 2) / (2 * H * W - 1))
-    assert agreeing_share(store, graph, [0, 1], 0 * gates) == 1.0
+    target[0, 1, 1] += 1e3
+    graph.record([0, 1], target, confidence)
+    share = explained_share(store, graph, [0, 1], gates)
+    assert share == pytest.approx((2 * H * W - 3) / (2 * H * W - 2), abs=1e-6)
+    assert explained_share(store, graph, [0, 1], 0 * gates) == 1.0
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.uncertainty import StoreField, UncertaintyView
+from droidw.solve.weights import agreeing_share
 from droidw_plugins.uncertainty import _objective as objective
 from droidw_plugins.uncertainty._options import ObjectiveOptions
 
@@ -63,8 +64,8 @@ def agreeing_majority(
     """How far residuals may be believed, in [0,1]: by the share that agrees with the poses.
 
     Where tracking has been lost, or follows what moves, most measured motion disagrees, and what
-    agrees is the wrong part. With a the mean of `1 / (1 + (r / scale)^2)` over all measurements,
-    weighted by confidence, the result is 0 up to a = `least` and 1 from 0.2 more.
+    agrees is the wrong part. With a the share that agrees (`droidw.solve.weights.agreeing_share`),
+    the result is 0 up to a = `least` and 1 from 0.2 more.
 
     Args:
         residual, confidence: [E,h,w], as for `residual_factor`.
@@ -73,8 +74,7 @@ def agreeing_majority(
     if least == 0:
         return 1.0
     weight, cut = _usable(residual, confidence)
-    agreeing = (weight / (1.0 + (cut / scale).square_())).sum() / weight.sum().clamp_min(1e-6)
-    return ((agreeing - least) / _RAMP).clamp(0.0, 1.0)
+    return ((agreeing_share(cut, weight, scale) - least) / _RAMP).clamp(0.0, 1.0)
 
 
 def _usable(residual: Tensor, confidence: Tensor) -> tuple[Tensor, Tensor]:
