@@ -61,8 +61,8 @@ class FlowOptions:
     edge_leak: float = field(
         default=0.3,
         metadata={
-            "help": "how much of an edge's power its power along itself has to exceed: bends and blur "
-            "of a line do not hold a match that slips along it",
+            "help": "share of the power across an edge that the power along it has to exceed: "
+            "bends and blur of a line do not hold a match that slips along it",
             "ge": 0.0,
         },
     )
