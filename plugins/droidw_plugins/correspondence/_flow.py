@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from droidw.slam.frame import Frame
     from droidw_plugins.correspondence.flow import FlowOptions
 
-# Flow fields kept at full size between the motion filter and the edges that want them.
+# Keyframes whose flow from the one before is kept at full size, from the motion filter until an
+# edge wants it: so many that what is found does not depend on how far ahead the filter has run.
 _FULL_FIELDS = 64
 # Matched share below which the motion so far says nothing of the next picture.
 _TRACKED = 0.1
@@ -54,6 +55,7 @@ class FlowCorrespondence:
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
         self._local = threading.local()
         self._lock = threading.Lock()
+        self._latest: tuple[tuple[int, int], Array] | None = None
         self._full: OrderedDict[tuple[int, int], Array] = OrderedDict()
         self._grid: OrderedDict[tuple[int, int], tuple[Array, Array]] = OrderedDict()
         self._pairs: OrderedDict[tuple[Hashable, ...], tuple[Edge, Edge]] = OrderedDict()
@@ -72,7 +74,13 @@ class FlowCorrespondence:
         return FlowFrame(frame.index, grey8, *seen, centres, self.stride)
 
     def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:
-        """Nothing more is needed of a keyframe."""
+        """Nothing more is needed of a keyframe; the flow that made it one is kept for its edge."""
+        if self._latest is not None and self._latest[0][1] == payload.index:
+            key, flow = self._latest
+            with self._lock:
+                self._full[key] = flow
+                while len(self._full) > _FULL_FIELDS:
+                    self._full.popitem(last=False)
         return payload
 
     def motion(self, reference: FlowFrame, current: FlowFrame) -> Motion:
@@ -85,11 +93,11 @@ class FlowCorrespondence:
             self._track = None
             return Motion(0.0, 0.0)  # a blank picture agrees with whatever is as bright
         start = None if self._track is None else self._track.ahead(reference, current)
-        moved, agrees = self._one_way(reference, current, lambda a, b: self.free(a, b, start))
-        motion = self._motion(moved, agrees, reference)
+        flow = self._search(reference, current, start)
+        self._latest = (reference.index, current.index), flow
+        motion = self._motion(*self._one_way(reference, current, lambda a, b: flow), reference)
         known = motion.matched > _TRACKED
-        flow = self._remembered(reference, current) if known else None
-        self._track = None if flow is None else Track.after(self._track, reference, current, flow)
+        self._track = Track.after(self._track, reference, current, flow) if known else None
         return motion
 
     def session(self, purpose: Purpose = "window") -> FlowSession:
@@ -129,21 +137,11 @@ class FlowCorrespondence:
         flow: Array = engine.calc(a.grey, b.grey, None if start is None else start.copy())
         return flow
 
-    def _remembered(self, a: FlowFrame, b: FlowFrame) -> Array | None:
-        """A dense flow a -> b that was measured not long ago."""
+    def _free(self, a: FlowFrame, b: FlowFrame) -> Array:
+        """Flow a -> b without geometry: the motion filter's, where it made b a keyframe."""
         with self._lock:
-            return self._full.get((a.index, b.index))
-
-    def free(self, a: FlowFrame, b: FlowFrame, start: Array | None = None) -> Array:
-        """Flow a -> b without geometry, remembered for a while; `start` [H,W,2] where known."""
-        flow = self._remembered(a, b)
-        if flow is None:
-            flow = self._search(a, b, start)
-            with self._lock:
-                self._full[(a.index, b.index)] = flow
-                while len(self._full) > _FULL_FIELDS:
-                    self._full.popitem(last=False)
-        return flow
+            flow = self._full.get((a.index, b.index))
+        return self._search(a, b) if flow is None else flow
 
     def _one_way(
         self, a: FlowFrame, b: FlowFrame, search: Callable[[FlowFrame, FlowFrame], Array]
@@ -236,7 +234,7 @@ class FlowCorrespondence:
         if start is not None:
             return self._search(a, b, self._dense(start, a), fine)
         if a.bridged is None and b.bridged is None:
-            return self.free(a, b)
+            return self._free(a, b)
         return self._search(a, b, None, fine)
 
     def _dense(self, target: Array, a: FlowFrame) -> Array:
