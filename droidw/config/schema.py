@@ -99,6 +99,9 @@ class SolverConfig:
     lm: float = opt(1e-4, "relative damping of the reduced system", ge=0)
     ep: float = opt(0.1, "absolute damping of the reduced system", ge=0)
     huber: float = opt(0.2, "Huber threshold in grid cells (0: quadratic)", ge=0)
+    cauchy: float = opt(
+        0.0, "residual in grid cells at which a Cauchy kernel halves a weight (0: none)", ge=0
+    )
     guard: bool = opt(False, "shorten or reject a step that raises the energy")
 
 
@@ -258,8 +261,10 @@ class DroidwConfig:
             "help": "phases: init_blind, init, init_again, window, window_kept, global, fill"
         },
     )
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    global_solver: SolverConfig = field(default_factory=lambda: SolverConfig(lm=1e-6, ep=1e-4))
+    solver: SolverConfig = field(default_factory=lambda: SolverConfig(cauchy=0.2))
+    global_solver: SolverConfig = field(
+        default_factory=lambda: SolverConfig(lm=1e-6, ep=1e-4, cauchy=0.75)
+    )
     filler_solver: SolverConfig = field(default_factory=SolverConfig)
 
     device: str = opt("auto", "auto, cpu, cuda, cuda:N")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,3 +107,13 @@ def test_a_guess_moves_where_a_calibration_holds():
         found = refine_focal(optimiser, graph, PHASE, SOLVER, camera, known)
         factors.append(abs(math.log(found.factor)))
     assert factors[0] < factors[1]
+
+
+def test_the_search_gives_up_no_measurement():
+    found = []
+    for cauchy in (0.0, 0.05):
+        optimiser, graph, _ = bench(wrong=1.08)
+        solver = replace(SOLVER, cauchy=cauchy)
+        camera = CameraConfig(focal_trust=0.0)
+        found.append(refine_focal(optimiser, graph, PHASE, solver, camera, known=True))
+    assert found[0] == found[1]

@@ -1,0 +1,103 @@
+"""What wrong matches cost bundle adjustment, with a kernel that gives them up and without."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.config.schema import PhaseConfig, SolverConfig, WeightingConfig
+from droidw.geometry.camera import Grid
+from droidw.geometry.projective import pixel_grid, reproject
+from droidw.geometry.se3 import exp, inv, log, mul
+from droidw.graph.factors import FactorGraph
+from droidw.graph.proximity import neighbour_edges
+from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.interfaces.correspondence import EdgeUpdate
+from droidw.slam.locate import locate
+from droidw.slam.optimise import Optimiser, Parts
+from droidw.slam.timing import Stopwatch
+from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
+
+H, W, COUNT = 12, 16, 6
+PHASE = PhaseConfig(updates=1, iterations=20, learn=False, weigh=False, depth_prior=False)
+
+
+def robust(cauchy: float) -> SolverConfig:
+    return SolverConfig(lm=1e-6, ep=1e-6, huber=0.2, cauchy=cauchy)
+
+
+@pytest.fixture
+def spoilt():
+    """True poses, and an optimiser some way off them, where half of each far edge is wrong.
+
+    Wrong all alike, as by one tile of a wall, so that no sum over directions helps.
+    """
+    grid, intrinsics = Grid(H, W, 8, 3.5), torch.tensor([110.0, 110.0, 63.5, 47.5])
+    store = KeyframeStore(grid, intrinsics)
+    s = torch.linspace(0, 1, COUNT)
+    T_cw = exp(torch.stack([0.8 * s, 0.3 * s * s, 0.1 * s, 0.1 * s, 0.2 * s, 0.1 * s], 1))
+    x, y = pixel_grid(H, W).unbind(-1)
+    disps = torch.stack([0.6 + 0.2 * (0.6 * x + k).sin() + 0.1 * y.cos() for k in range(COUNT)])
+    off = exp(0.01 * torch.randn(COUNT, 6, generator=torch.Generator().manual_seed(1)))
+    off[:2] = exp(torch.zeros(2, 6))  # both are held, and with them the scale
+    for k in range(COUNT):
+        blank = np.zeros((H * 8, W * 8, 3), np.uint8)
+        info = KeyframeInfo(k, k / 10, "", blank, None)
+        store.append(info, T_cw=mul(off[k], T_cw[k]), disps=disps[k])
+    graph = FactorGraph(H, W, store.device)
+    graph.add(neighbour_edges(COUNT, 3))
+    ii, jj = graph.index(graph.select())
+    graph.target[:], valid = reproject(T_cw, disps, grid.intrinsics(intrinsics), ii, jj)
+    graph.confidence[:] = valid[..., None].float()
+    far = torch.tensor(graph.ii) - torch.tensor(graph.jj)
+    graph.target[far.abs() == 3, :, : W // 2] += torch.tensor([2.0, 1.0])
+    parts = Parts(None, None, None, TorchBundleAdjuster(), None)
+    return Optimiser(store, parts, WeightingConfig(), Stopwatch()), graph, T_cw
+
+
+def apart(found: torch.Tensor, true: torch.Tensor) -> float:
+    """Largest difference of poses, tangent norm."""
+    return float(log(mul(found, inv(true))).norm(dim=-1).max())
+
+
+def test_matches_that_are_wrong_alike_pull_a_huber_kernel_and_not_a_cauchy_kernel(spoilt):
+    optimiser, graph, T_cw = spoilt
+    store = optimiser.store
+    start = store.T_cw.clone(), store.disps.clone()
+    left = []
+    for cauchy in (0.0, 0.2):
+        store.write(*start)
+        optimiser.adjust(graph, graph.select(), PHASE, robust(cauchy), first_free=2)
+        left.append(apart(store.T_cw, T_cw))
+    assert left[1] < 0.2 * left[0]
+    assert torch.isfinite(store.disps).all()
+
+
+def test_a_frame_is_located_in_spite_of_them(spoilt):
+    optimiser, graph, T_cw = spoilt
+    last = COUNT - 1
+    row = graph.pairs.index((last - 3, last))
+    answer = EdgeUpdate(graph.target[row : row + 1], graph.confidence[row : row + 1])
+    session = SimpleNamespace(update=lambda request: answer)
+    optimiser.parts = Parts(
+        None, None, None, TorchBundleAdjuster(), SimpleNamespace(session=lambda purpose: session)
+    )
+    optimiser.store.write(T_cw, optimiser.store.disps)
+    left = []
+    for cauchy in (0.0, 0.2):
+        found = locate(
+            optimiser,
+            [None],
+            mul(exp(torch.full((1, 6), 0.01)), T_cw[last:]),
+            [[last - 3]],
+            torch.ones(COUNT, H, W),
+            updates=1,
+            iterations=20,
+            solver=robust(cauchy),
+            label="test",
+        )
+        left.append(apart(found, T_cw[last:]))
+    assert left[1] < 0.2 * left[0]
