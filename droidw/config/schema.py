@@ -261,7 +261,7 @@ class DroidwConfig:
             "help": "phases: init_blind, init, init_again, window, window_kept, global, fill"
         },
     )
-    solver: SolverConfig = field(default_factory=lambda: SolverConfig(cauchy=0.2))
+    solver: SolverConfig = field(default_factory=lambda: SolverConfig(cauchy=0.15))
     global_solver: SolverConfig = field(
         default_factory=lambda: SolverConfig(lm=1e-6, ep=1e-4, cauchy=0.75)
     )

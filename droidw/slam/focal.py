@@ -109,7 +109,7 @@ def refine_focal(
     start = store.T_cw.clone(), store.disps.clone()
     rows = graph.select()
     steps = replace(phase, iterations=_STEPS, learn=False)
-    # A kernel that gives up what is far off would make the energy of a bad fit look small.
+    # Weights that change with the residuals would make each energy a sum of other weights.
     solver = replace(solver, cauchy=0.0)
 
     def place(x: float) -> None:

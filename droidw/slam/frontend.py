@@ -128,7 +128,11 @@ class Frontend:
         return better
 
     def _settled_cost(self, weigh: bool) -> float:
-        """Energy of all edges at the present poses and depths, with uncertainty or without."""
+        """Energy of all edges at the present poses and depths, with uncertainty or without.
+
+        By a Cauchy kernel of the solver, what is far off hardly counts: the less of the energy, the
+        more of what was measured agrees.
+        """
         before = self.store.T_cw.clone(), self.store.disps.clone()
         row = self.config.schedule["init_blind"]
         phase = replace(row, iterations=1, learn=False, weigh=weigh)

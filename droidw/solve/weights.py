@@ -2,7 +2,8 @@
 
 And what they weigh: how much of the measured motion agrees with the poses.
 
-Bundle adjustment never sees an uncertainty: it gets `confidence x gate x validity`.
+Bundle adjustment never sees an uncertainty: it gets `confidence x gate x validity`, and less where
+a match is far from what the poses predict.
 """
 
 from __future__ import annotations
