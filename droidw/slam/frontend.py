@@ -18,7 +18,7 @@ from droidw.slam.locate import carry_depth, locate
 from droidw.slam.starts import mirrored, plane_starts
 
 if TYPE_CHECKING:
-    from droidw.config.schema import DroidwConfig, PhaseConfig
+    from droidw.config.schema import DroidwConfig, PhaseConfig, SolverConfig
     from droidw.slam.optimise import Optimiser
 
 __all__ = ["Frontend"]
@@ -28,6 +28,8 @@ _MOST_DROPS = 5
 # Gauss-Newton steps of a start at initialisation, and the share of the energy that it must beat.
 _TRIAL_STEPS = 15
 _BETTER = 0.98
+# Share of the first keyframes that must be closed as what can move, for it to count as known.
+_KNOWN_MOVERS = 0.02
 # Gauss-Newton steps that bring a new keyframe to its predecessor.
 _MATCH_STEPS = 4
 
@@ -50,6 +52,7 @@ class Frontend:
         self.session = optimiser.parts.correspondence.session("window")
         self.initialised = False
         self._drops = 0
+        self._solver = config.solver
         # Maps whose mean depth the next keyframe starts from, with `predict: hold`.
         self._recent = 1
         self._published = "droid-w" in config.compat
@@ -75,6 +78,7 @@ class Frontend:
         schedule, options = self.config.schedule, self.options
         self.graph.add(neighbour_edges(count, 3))
         self.optimiser.begin()
+        self._solver = self._first_solver()
         self._updates("init_blind", first_free=1, informed=False)
         if options.starts:
             self._try_mirrored()
@@ -89,6 +93,7 @@ class Frontend:
                 self._updates(phase, first_free=1)
             self._retire([r for r in self.graph.select() if self.graph.ii[r] < count - 4])
         self._recent = 4
+        self._solver = self.config.solver
         self.initialised = True
 
     def release(self) -> None:
@@ -119,7 +124,7 @@ class Frontend:
         better = False
         for start in plane_starts(store.disps):
             store.write(*start)
-            self.optimiser.adjust(self.graph, rows, phase, self.config.solver, first_free=1)
+            self.optimiser.adjust(self.graph, rows, phase, self._solver, first_free=1)
             found = self._settled_cost(weigh=True)
             if found < cost:
                 cost, better = found, True
@@ -137,9 +142,20 @@ class Frontend:
         row = self.config.schedule["init_blind"]
         phase = replace(row, iterations=1, learn=False, weigh=weigh)
         rows = list(range(len(self.graph)))
-        self.optimiser.adjust(self.graph, rows, phase, self.config.solver, first_free=1)
+        self.optimiser.adjust(self.graph, rows, phase, self._solver, first_free=1)
         self.store.write(*before)
         return self.optimiser.cost
+
+    def _first_solver(self) -> SolverConfig:
+        """The solver of initialisation: with its Cauchy kernel where it is known what can move.
+
+        Where that is not known, the kernel would hold on to whatever most of the texture is on,
+        which may well be what moves, and give up the rest.
+        """
+        solver = self.config.solver
+        closed = self.optimiser.gates(learned=True) < 0.5
+        known = float(closed.float().mean()) > _KNOWN_MOVERS
+        return solver if known else replace(solver, cauchy=0.0)
 
     def _phase(self, name: str) -> PhaseConfig:
         """A row of the schedule; uncertainty that begins with something weighs from the first."""
@@ -153,7 +169,7 @@ class Frontend:
                 self.graph,
                 self.session,
                 row,
-                self.config.solver,
+                self._solver,
                 first_free=first_free,
                 informed=informed,
             )
