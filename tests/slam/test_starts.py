@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import pytest
 import torch
 
+from droidw.config.schema import SolverConfig
 from droidw.geometry import projective, se3
+from droidw.slam.frontend import Frontend
 from droidw.slam.locate import carry_depth
 from droidw.slam.starts import mirrored, plane_starts
 
@@ -59,3 +64,15 @@ def test_carried_depth_without_any_overlap_is_the_old_one():
     disps = torch.full((12, 16), 0.5)
     T_cw = se3.exp(torch.tensor([[0.0] * 6, [50.0, 0.0, 0.0, 0.0, 0.0, 0.0]]))
     assert torch.equal(carry_depth(disps, T_cw, K), disps)
+
+
+@pytest.mark.parametrize(("closed", "cauchy"), [(0.0, 0.0), (0.01, 0.0), (0.05, 0.15)])
+def test_far_matches_are_given_up_at_first_only_where_it_is_known_what_can_move(closed, cauchy):
+    gates = torch.ones(8, 10, 10)
+    gates.view(-1)[: round(closed * gates.numel())] = 0.1
+    frontend = Frontend.__new__(Frontend)
+    frontend.config = SimpleNamespace(solver=SolverConfig(huber=0.2, cauchy=0.15))
+    frontend.optimiser = SimpleNamespace(gates=lambda learned: gates)
+    solver = frontend._first_solver()
+    assert solver.cauchy == cauchy
+    assert solver.huber == 0.2
