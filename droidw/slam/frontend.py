@@ -153,6 +153,8 @@ class Frontend:
         which may well be what moves, and give up the rest.
         """
         solver = self.config.solver
+        if solver.cauchy == 0:
+            return solver
         closed = self.optimiser.gates(learned=True) < 0.5
         known = float(closed.float().mean()) > _KNOWN_MOVERS
         return solver if known else replace(solver, cauchy=0.0)

@@ -12,7 +12,7 @@ from droidw.geometry.projective import depth_there, reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.solve.problem import BAProblem
-from droidw.solve.weights import redescend, residual_weights
+from droidw.solve.weights import redescended, residual_weights
 
 if TYPE_CHECKING:
     from droidw.config.schema import SolverConfig
@@ -81,10 +81,6 @@ def locate(
         )
         with optimiser.clock(f"{label}: bundle"):
             for _ in range(iterations):
-                trusted = weight
-                if solver.cauchy:
-                    coords, _ = reproject(T_cw, disps, store.intrinsics, ii, jj)
-                    trusted = redescend(weight, answer.target - coords, solver.cauchy)
                 problem = BAProblem(
                     T_cw=T_cw,
                     disps=disps,
@@ -92,7 +88,7 @@ def locate(
                     ii=ii,
                     jj=jj,
                     target=answer.target,
-                    weight=trusted,
+                    weight=weight,
                     fixed=fixed,
                     damping=torch.zeros_like(disps),
                     motion_only=True,
@@ -101,7 +97,7 @@ def locate(
                     huber=solver.huber or None,
                     pairs=pairs,
                 )
-                T_cw = optimiser.parts.ba.step(problem).T_cw
+                T_cw = optimiser.parts.ba.step(redescended(problem, solver.cauchy)).T_cw
     return T_cw[len(used) :]
 
 

@@ -15,7 +15,7 @@ from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.interfaces.uncertainty import Indices, UncertaintyView
 from droidw.solve.problem import BAProblem, Report
-from droidw.solve.weights import gate, redescend, residual_weights
+from droidw.solve.weights import gate, redescended, residual_weights
 
 if TYPE_CHECKING:
     from droidw.config.schema import PhaseConfig, SolverConfig, WeightingConfig
@@ -212,11 +212,6 @@ class Optimiser:
             bidirectional=weighting.bidirectional,
             scale=weighting.confidence_scale,
         )
-        if solver.cauchy:
-            coords, _ = reproject(
-                store.T_cw[low:], store.disps[low:], store.intrinsics, edges.ii, edges.jj
-            )
-            weight = redescend(weight, target - coords, solver.cauchy)
         count = len(store) - low
         fixed = torch.arange(count, device=store.device) < first_free - low
         problem = BAProblem(
@@ -239,7 +234,7 @@ class Optimiser:
             max_disp=weighting.max_disp or None,
             pairs=edges.pairs,
         )
-        step = self.parts.ba.step(problem)
+        step = self.parts.ba.step(redescended(problem, solver.cauchy))
         self._note(step.report)
         self.cost = step.report.cost_before
         store.T_cw[low:] = step.T_cw

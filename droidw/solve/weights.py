@@ -8,17 +8,21 @@ a match is far from what the poses predict.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch.nn import functional as F
 
+from droidw.geometry.projective import reproject
 from droidw.geometry.transfer import on_device
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["GateKind", "agreeing_share", "gate", "redescend", "residual_weights"]
+    from droidw.solve.problem import BAProblem
+
+__all__ = ["GateKind", "agreeing_share", "gate", "redescend", "redescended", "residual_weights"]
 
 GateKind = Literal["rational", "inverse", "none"]
 
@@ -119,6 +123,14 @@ def redescend(weight: Tensor, residual: Tensor, scale: float) -> Tensor:
     square = (energy / mean.clamp_min(torch.finfo(mean.dtype).tiny)).clamp_min(0.0)
     factor = (1.0 + square / scale**2).reciprocal()
     return weight * torch.where(torch.isfinite(factor), factor, 1.0)[..., None]
+
+
+def redescended(problem: BAProblem, scale: float) -> BAProblem:
+    """The problem with weights as `redescend` leaves them at its poses and depths; 0: itself."""
+    if scale == 0:
+        return problem
+    coords, _ = reproject(problem.T_cw, problem.disps, problem.intrinsics, problem.ii, problem.jj)
+    return replace(problem, weight=redescend(problem.weight, problem.target - coords, scale))
 
 
 def agreeing_share(residual: Tensor, weight: Tensor, scale: float, nothing: float = 0.0) -> Tensor:
