@@ -14,8 +14,7 @@ from droidw.testing.pretend_gpu import PretendGpu
 MOVING = ("motion_filter.threshold=0.3", "motion_filter.force_every=0", "ba=torch")
 FLOW = ("--preset", "cpu", "features={name: fit3d, options: {precision: float32}}",
         "depth={name: metric3d, options: {variant: vit-small, size: [56, 84], precision: float32}}",
-        # a camera that hardly moves is held by lines alone: the last place would grow to 7 %
-        "correspondence.options.edge_leak=0")  # fmt: skip
+        )  # fmt: skip
 DROID = ("--preset", "droid-slam", "correspondence.options={precision: float32, store: float}",
          "uncertainty=affine-softplus", "features=fit3d", "frontend.predict=velocity")  # fmt: skip
 RUNS = {"flow": FLOW, "droid": DROID}

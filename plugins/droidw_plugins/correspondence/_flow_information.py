@@ -17,6 +17,8 @@ __all__ = ["information", "sample", "structure", "trust"]
 
 # Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
 _FLAT = 0.1
+# Keeps the power of a flat window from being divided by itself.
+_NOTHING = np.float32(1e-12)
 
 
 def sample(values: Any, points: Array, outside: float | None = None) -> Array:
@@ -86,9 +88,9 @@ def information(frame: FlowFrame, across: Array, along: Array, options: FlowOpti
     """Information (xx, yy, xy) of matches from a frame, [h,w,3] float32.
 
     Along each eigenvector of the structure tensor its eigenvalue says how much of the trust counts:
-    power / (power + texture^2). What the second has to exceed grows by `edge_leak` times the
-    difference of the two: a bend, a blurred end or noise of a strong line gives it some power along
-    itself, by which a match that slips along the line would count as known.
+    power / (power + texture^2). A bend, a blurred end or noise of a strong line gives it some power
+    along itself, by which a match that slips along the line would count as known: the second counts
+    by r^2 / (r^2 + edge_leak^2), with r its share of the first.
 
     Args:
         across, along: [h,w] in [0,1], trust along the first and the second eigenvector.
@@ -99,7 +101,9 @@ def information(frame: FlowFrame, across: Array, along: Array, options: FlowOpti
         strong, weak = frame.power[..., 0], frame.power[..., 1]
         level = np.float32(options.texture**2)
         first = across * strong / (strong + level)
-        second = along * weak / (weak + level + np.float32(options.edge_leak) * (strong - weak))
+        leaked = (np.float32(options.edge_leak) * strong) ** 2
+        held = weak**2 / np.maximum(weak**2 + leaked, _NOTHING)
+        second = along * held * weak / (weak + level)
     x, y = frame.normal[..., 0], frame.normal[..., 1]
     matrix = np.stack(
         [first * x * x + second * y * y, first * y * y + second * x * x, (first - second) * x * y],

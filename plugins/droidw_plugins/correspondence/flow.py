@@ -59,10 +59,10 @@ class FlowOptions:
         },
     )
     edge_leak: float = field(
-        default=0.3,
+        default=0.1,
         metadata={
-            "help": "share of the power across an edge that the power along it has to exceed: "
-            "bends and blur of a line do not hold a match that slips along it",
+            "help": "power along an edge, as a share of that across it, at which confidence along "
+            "it halves: bends and blur of a line do not hold a match that slips along it",
             "ge": 0.0,
         },
     )
