@@ -12,9 +12,12 @@ from droidw.slam.streams import Ahead, tensors_in
 from droidw.testing.pretend_gpu import PretendGpu
 
 MOVING = ("motion_filter.threshold=0.3", "motion_filter.force_every=0", "ba=torch")
-FLOW = ("--preset", "cpu", "features={name: fit3d, options: {precision: float32}}",
-        "depth={name: metric3d, options: {variant: vit-small, size: [56, 84], precision: float32}}",
-        )  # fmt: skip
+FLOW = (
+    "--preset",
+    "cpu",
+    "features={name: fit3d, options: {precision: float32}}",
+    "depth={name: metric3d, options: {variant: vit-small, size: [56, 84], precision: float32}}",
+)
 DROID = ("--preset", "droid-slam", "correspondence.options={precision: float32, store: float}",
          "uncertainty=affine-softplus", "features=fit3d", "frontend.predict=velocity")  # fmt: skip
 RUNS = {"flow": FLOW, "droid": DROID}
