@@ -44,8 +44,8 @@ class KeyframeStore:
     Core fields, each [N,...] and returned as views into the storage:
         T_cw [7] world to camera; disps [h,w] inverse depth; prior [h,w] inverse depth of the
         depth prior (0: none); features [c,h,w]; uncertainty [h,w]; damping [h,w] learned;
-        unmasked [h,w] in [0,1], the share of a cell that the user's mask leaves; movable [h,w] in
-        [0,1], how likely features find what can move by itself (0: not asked).
+        unmasked [h,w] in [0,1], what the user's mask leaves of a cell and its neighbours; movable
+        [h,w] in [0,1], how likely features find what can move by itself (0: not asked).
 
     Args:
         grid: the grid on which maps live.

@@ -28,6 +28,7 @@ from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict, look_ahead
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.streams import Ahead
 from droidw.slam.timing import Stopwatch
+from droidw.solve.weights import unmasked
 
 if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig
@@ -204,7 +205,8 @@ class SlamSystem:
         prior = self._prior(frame) if current.prior is None else current.prior
         pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
         if frame.mask is not None:
-            known = {"unmasked": 1 - self.grid.covered(upload(frame.mask, store.device))}
+            covered = self.grid.covered(upload(frame.mask, store.device))
+            known = {"unmasked": unmasked(covered)}
         else:
             known = {}
         if self.optimiser.begins and not self.frontend.initialised:

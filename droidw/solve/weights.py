@@ -22,7 +22,15 @@ if TYPE_CHECKING:
 
     from droidw.solve.problem import BAProblem
 
-__all__ = ["GateKind", "agreeing_share", "gate", "redescend", "redescended", "residual_weights"]
+__all__ = [
+    "GateKind",
+    "agreeing_share",
+    "gate",
+    "redescend",
+    "redescended",
+    "residual_weights",
+    "unmasked",
+]
 
 GateKind = Literal["rational", "inverse", "none"]
 
@@ -61,6 +69,17 @@ def gate(
     else:
         raise ValueError(f"no gate is called {kind!r}; valid: rational, inverse, none")
     return torch.where(torch.isfinite(u), weight, torch.zeros_like(weight))
+
+
+def unmasked(covered: Tensor) -> Tensor:
+    """Share in [0,1] that a user's mask leaves of each cell and of the cells around it, [h,w].
+
+    A match is made with what surrounds its cell: beside what is masked it follows that in part.
+
+    Args:
+        covered: [h,w] share of each cell that the mask covers, in [0,1].
+    """
+    return 1.0 - F.max_pool2d(covered[None], kernel_size=3, stride=1, padding=1)[0]
 
 
 def residual_weights(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from droidw.solve.weights import gate, redescend, residual_weights
+from droidw.solve.weights import gate, redescend, residual_weights, unmasked
 
 
 def test_rational_gate_matches_the_published_table() -> None:
@@ -124,3 +124,12 @@ def test_the_scale_of_weights_does_not_matter_and_nonsense_stays_to_be_counted()
     assert once[0, 0].tolist() == [[0.5, 0.5], [1.0, 1.0], [0.0, 0.0]]
     broken = redescend(torch.full_like(weight, float("nan")), residual, 0.5)
     assert bool(torch.isnan(broken).all())
+
+
+def test_a_user_mask_reaches_the_cells_around_what_it_covers() -> None:
+    covered = torch.zeros(5, 6)
+    covered[0, 1], covered[3, 4] = 1.0, 0.25
+    expected = torch.ones(5, 6)
+    expected[:2, :3] = 0.0
+    expected[2:, 3:] = 0.75
+    assert torch.equal(unmasked(covered), expected)

@@ -67,11 +67,13 @@ class FlowCorrespondence:
         centres = grid.centres().numpy().astype(np.float32)
         scaled = grey * np.float32(255.0)
         grey8 = np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
+        covered = None
         if frame.mask is not None:
-            grey8 = without(grey8, frame.mask.cpu().numpy())
+            covered = frame.mask.cpu().numpy()
+            grey8 = without(grey8, covered)
             scaled = grey8.astype(np.float32)
-        seen = structure(scaled, centres, self.stride)
-        return FlowFrame(frame.index, grey8, *seen, centres, self.stride)
+        seen = structure(scaled, centres, self.stride, covered)
+        return FlowFrame(frame.index, grey8, *seen, centres, self.stride, covered)
 
     def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:
         """Nothing more is needed of a keyframe; the flow that made it one is kept for its edge."""
@@ -215,13 +217,13 @@ class FlowCorrespondence:
         ):
             return replace(known[0]), replace(known[1])
         ab, ba = self._started(a, b, start_ab, fine), self._started(b, a, start_ba, fine)
-        both = self._checked(a, ab, ba, start_ab), self._checked(b, ba, ab, start_ba)
+        both = self._checked(c, ab, ba, start_ab), self._checked(d, ba, ab, start_ba)
         if again:
             ab, ba = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
             share = self.options.bridged_share
             both = (
-                surer(both[0], self._checked(a, ab, ba, start_ab), c.bridged, share),
-                surer(both[1], self._checked(b, ba, ab, start_ba), d.bridged, share),
+                surer(both[0], self._checked(c, ab, ba, start_ab), c.bridged, share),
+                surer(both[1], self._checked(d, ba, ab, start_ba), d.bridged, share),
             )
         with self._lock:
             self._pairs[key] = both

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from droidw_plugins.correspondence._flow_information import grown, structure
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
 __all__ = ["bridge", "surer", "without"]
@@ -38,8 +39,7 @@ def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
         grey: [H,W] uint8.
         mask: [H,W], True where the picture is to be ignored.
     """
-    size = 2 * _MARGIN + 1
-    covered: Any = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
+    covered = grown(mask, _MARGIN)
     if not covered.any():
         return grey
     known: Any = 1.0 - covered.astype(np.float32)
@@ -52,20 +52,35 @@ def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
         above = cv2.pyrUp(bridge, dstsize=(level.shape[1], level.shape[0]))
         bridge = level + above * (1.0 - share)
     filled = np.clip(bridge + 0.5, 0, 255).astype(np.uint8)
-    return np.where(covered > 0, filled, grey)
+    return np.where(covered, filled, grey)
 
 
 def bridge(frame: FlowFrame, gate: Array, below: float) -> FlowFrame:
     """The frame with a bridge over the cells whose gate [h,w] is less than `below`.
 
-    It is the frame itself where these are too few to matter. Texture stays that of the picture.
+    It is the frame itself where these are too few to matter. Structure beside these cells is that
+    of what is left; in them it stays that of the picture, by which they keep some confidence.
     """
     closed = gate < below
     if closed.mean() < _FEW:
         return frame
     height, width = frame.grey.shape
     mask: Any = cv2.resize(closed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-    return replace(frame, grey=without(frame.grey, mask > 0), bridged=closed)
+    moving = mask > 0
+    covered = moving if frame.covered is None else moving | frame.covered
+    left = structure(frame.grey.astype(np.float32), frame.centres, frame.stride, covered)
+    whole = frame.texture, frame.power, frame.normal
+    texture, power, normal = (
+        np.where(closed[..., None], w, part) for w, part in zip(whole, left, strict=True)
+    )
+    return replace(
+        frame,
+        grey=without(frame.grey, moving),
+        texture=texture,
+        power=power,
+        normal=normal,
+        bridged=closed,
+    )
 
 
 def surer(

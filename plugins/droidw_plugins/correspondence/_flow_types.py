@@ -27,6 +27,7 @@ class FlowFrame:
             eigenvalues of the structure tensor, larger first, (grey levels per pixel)^2.
         normal: [h,w,2] unit vector across the strongest edge, x and y.
         centres: [h,w,2] of the cells, pixels.
+        covered: [H,W] what the user's mask covers: `grey` is a smooth bridge there; None: nothing.
         bridged: [h,w] cells over which `grey` is a smooth bridge, see `_flow_mask`; None: nowhere.
     """
 
@@ -37,6 +38,7 @@ class FlowFrame:
     normal: Array
     centres: Array
     stride: int
+    covered: npt.NDArray[np.bool_] | None = None
     bridged: npt.NDArray[np.bool_] | None = None
 
 
