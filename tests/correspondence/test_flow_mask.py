@@ -138,14 +138,15 @@ def beside(cells, reach):
 def test_a_contour_of_what_moves_says_nothing_of_a_blank_wall_beside_it(pair, measured, by):
     frames = pair(shift=-6, other=10, contrast=0.0)
     plain = [replace(f, mask=None) for f in frames]
-    if by == "mask":
-        [(_, taken)], [(_, left)] = measured(plain), measured(frames)
-    else:
-        (_, taken), (_, left) = measured(plain, closed())
+    asked = (frames,) if by == "mask" else (plain, closed())
+    taken, left = measured(plain)[0][1], measured(*asked)[-1][1]
+    kept = measured(*asked, reach=0)[-1][1]
     wall = torch.ones(GRID.height, GRID.width, dtype=torch.bool)
     wall[6:14, 8:18] = False  # where the patch is in the first
     assert float(taken[..., :2][wall].max()) > 0.5
     assert float(left[wall].abs().max()) < 1e-6
+    if by == "uncertainty":
+        assert float(kept[..., :2][wall].max()) > 0.5
 
 
 def test_what_a_user_masks_stays_masked_where_uncertainty_closes_more(frame, operator):
@@ -154,7 +155,7 @@ def test_what_a_user_masks_stays_masked_where_uncertainty_closes_more(frame, ope
     plain = operator().encode(frame(0, grey), GRID)
     gate = np.ones((GRID.height, GRID.width), dtype=np.float32)
     gate[:, -6:] = 0.1
-    both, alone = bridge(masked, gate, 0.5), bridge(plain, gate, 0.5)
+    both, alone = bridge(masked, gate, 0.5, 7), bridge(plain, gate, 0.5, 7)
     covered = GRID.covered(torch.from_numpy(hole())).numpy() == 1
     assert (both.power[covered] < 1e-3).all() and (alone.power[covered][..., 0] > 1).all()
     assert np.array_equal(both.power[:, :5], alone.power[:, :5])

@@ -20,7 +20,7 @@ from droidw_plugins.correspondence._flow_information import (
     structure,
     trust,
 )
-from droidw_plugins.correspondence._flow_mask import surer, without
+from droidw_plugins.correspondence._flow_mask import grown, surer, without
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Track
 
@@ -67,12 +67,13 @@ class FlowCorrespondence:
         centres = grid.centres().numpy().astype(np.float32)
         scaled = grey * np.float32(255.0)
         grey8 = np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
-        covered = None
+        covered = flat = None
         if frame.mask is not None:
             covered = frame.mask.cpu().numpy()
             grey8 = without(grey8, covered)
             scaled = grey8.astype(np.float32)
-        seen = structure(scaled, centres, self.stride, covered)
+            flat = grown(covered, self.options.reach) if self.options.reach else None
+        seen = structure(scaled, centres, self.stride, flat)
         return FlowFrame(frame.index, grey8, *seen, centres, self.stride, covered)
 
     def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:

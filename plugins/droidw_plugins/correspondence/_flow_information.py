@@ -14,13 +14,10 @@ if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow_types import FlowFrame
     from droidw_plugins.correspondence.flow import FlowOptions
 
-__all__ = ["grown", "information", "sample", "structure", "trust"]
+__all__ = ["information", "sample", "structure", "trust"]
 
 # Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
 _FLAT = 0.1
-# Pixels around what is covered that the search takes for part of it, or it for part of them: half
-# a patch of 8 pixels in pictures of half the size.
-_REACH = 7
 # Keeps the power of a flat window from being divided by itself.
 _NOTHING = np.float32(1e-12)
 
@@ -48,8 +45,8 @@ def structure(
     Args:
         grey: [H,W] in grey levels. centres: [h,w,2] pixels. stride: of the grid; a window has
             twice its width.
-        covered: [H,W] pixels that count as flat, with what lies `_REACH` around them: a contour
-            of what moves says nothing of where a wall beside it went.
+        covered: [H,W] pixels that count as flat: a contour of what moves says nothing of where a
+            wall beside it went.
     Returns:
         `texture`, `power` and `normal` of `FlowFrame`, [h,w,2] each.
     """
@@ -57,9 +54,8 @@ def structure(
     dx = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32)
     dy = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32)
     if covered is not None:
-        flat = grown(covered, _REACH)
-        dx[flat] = 0.0
-        dy[flat] = 0.0
+        dx[covered] = 0.0
+        dy[covered] = 0.0
     xx, yy, xy = (
         sample(cv2.blur(p, window, borderType=cv2.BORDER_REPLICATE), centres)
         for p in (dx * dx, dy * dy, dx * dy)
@@ -75,14 +71,6 @@ def structure(
     angle = 0.5 * np.arctan2(xy, half)
     normal = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
     return texture, power, normal
-
-
-def grown(mask: npt.NDArray[np.bool_], margin: int) -> npt.NDArray[np.bool_]:
-    """The mask [H,W] and what lies up to `margin` pixels around it, in rows and columns."""
-    size = 2 * margin + 1
-    wide: Any = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
-    covered: npt.NDArray[np.bool_] = wide > 0
-    return covered
 
 
 def trust(apart: Array, normal: Array, options: FlowOptions) -> tuple[Array, Array]:

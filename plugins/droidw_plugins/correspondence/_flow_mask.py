@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from droidw_plugins.correspondence._flow_information import grown, structure
+from droidw_plugins.correspondence._flow_information import structure
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
-__all__ = ["bridge", "surer", "without"]
+__all__ = ["bridge", "grown", "surer", "without"]
 
 Picture = npt.NDArray[np.uint8]
 
@@ -26,6 +26,14 @@ _COARSEST = 2
 _SOME = 1e-3
 # Share of cells below which a bridge is not worth a second search.
 _FEW = 0.02
+
+
+def grown(mask: npt.NDArray[np.bool_], margin: int) -> npt.NDArray[np.bool_]:
+    """The mask [H,W] and what lies up to `margin` pixels around it, in rows and columns."""
+    size = 2 * margin + 1
+    wide: Any = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
+    covered: npt.NDArray[np.bool_] = wide > 0
+    return covered
 
 
 def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
@@ -55,11 +63,12 @@ def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
     return np.where(covered, filled, grey)
 
 
-def bridge(frame: FlowFrame, gate: Array, below: float) -> FlowFrame:
+def bridge(frame: FlowFrame, gate: Array, below: float, reach: int) -> FlowFrame:
     """The frame with a bridge over the cells whose gate [h,w] is less than `below`.
 
     It is the frame itself where these are too few to matter. Structure beside these cells is that
-    of what is left; in them it stays that of the picture, by which they keep some confidence.
+    of what lies more than `reach` pixels from them (0: of the picture); in them it stays that of
+    the picture, by which they keep some confidence.
     """
     closed = gate < below
     if closed.mean() < _FEW:
@@ -67,20 +76,17 @@ def bridge(frame: FlowFrame, gate: Array, below: float) -> FlowFrame:
     height, width = frame.grey.shape
     mask: Any = cv2.resize(closed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     moving = mask > 0
+    made = replace(frame, grey=without(frame.grey, moving), bridged=closed)
+    if reach == 0:
+        return made
     covered = moving if frame.covered is None else moving | frame.covered
-    left = structure(frame.grey.astype(np.float32), frame.centres, frame.stride, covered)
+    grey = frame.grey.astype(np.float32)
+    left = structure(grey, frame.centres, frame.stride, grown(covered, reach))
     whole = frame.texture, frame.power, frame.normal
     texture, power, normal = (
         np.where(closed[..., None], w, part) for w, part in zip(whole, left, strict=True)
     )
-    return replace(
-        frame,
-        grey=without(frame.grey, moving),
-        texture=texture,
-        power=power,
-        normal=normal,
-        bridged=closed,
-    )
+    return replace(made, texture=texture, power=power, normal=normal)
 
 
 def surer(

@@ -134,14 +134,15 @@ class FlowSession:
 
     def _bridged(self, request: EdgeRequest, rows: list[int]) -> dict[int, FlowFrame]:
         """By node: pictures of these edges with something to leave out, and without it."""
-        below = self._owner.options.bridge
-        if request.gates is None or not rows or below == 0:
+        options = self._owner.options
+        if request.gates is None or not rows or options.bridge == 0:
             return {}
         nodes = sorted({node for row in rows for node in _ends(request, row)})
         gates = request.gates(nodes).cpu().numpy()
         frames = [request.payload(node) for node in nodes]
         jobs: list[Callable[[], Any]] = [
-            partial(bridge, f, g, below) for f, g in zip(frames, gates, strict=True)
+            partial(bridge, f, g, options.bridge, options.reach)
+            for f, g in zip(frames, gates, strict=True)
         ]
         made = zip(nodes, self._owner.map(jobs), strict=True)
         return {node: frame for node, frame in made if frame.bridged is not None}

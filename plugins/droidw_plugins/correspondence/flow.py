@@ -66,6 +66,14 @@ class FlowOptions:
             "ge": 0.0,
         },
     )
+    reach: int = field(
+        default=7,
+        metadata={
+            "help": "pixels around what a mask covers or uncertainty takes out that a search mixes "
+            "with it: none of these counts as structure of a cell beside it (0: all do)",
+            "ge": 0,
+        },
+    )
     restart: float = field(
         default=2.0,
         metadata={
