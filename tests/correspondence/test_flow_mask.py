@@ -64,6 +64,7 @@ def pair(frame):
         pictures = [scene, np.roll(scene, shift, axis=1)]
         patches = [patch, np.roll(patch, other, axis=1)]
         made = [np.where(m, p, s) for m, p, s in zip(masks, patches, pictures, strict=True)]
+        made = [grey.round() for grey in made]  # as a decoder gives them
         return [frame(n, grey, m) for n, (grey, m) in enumerate(zip(made, masks, strict=True))]
 
     return call
@@ -162,9 +163,10 @@ def test_what_a_user_masks_stays_masked_where_uncertainty_closes_more(frame, ope
     assert np.array_equal(both.power[:, -6:], masked.power[:, -6:])
 
 
-def test_what_uncertainty_rejects_does_not_pull_at_its_surroundings(pair, measured):
+@pytest.mark.parametrize("reach", [0, 7])
+def test_what_uncertainty_rejects_does_not_pull_at_its_surroundings(pair, measured, reach):
     frames = [replace(f, mask=None) for f in pair(shift=-6, other=10, contrast=0.1)]
-    (before, sure_before), (after, sure_after) = measured(frames, closed())
+    (before, sure_before), (after, sure_after) = measured(frames, closed(), reach=reach)
     truth = torch.tensor([-6.0, 0.0])
     right = [
         float((c[..., :2].mean(-1) * ((m - truth).norm(dim=-1) < 1)).sum())
@@ -173,8 +175,9 @@ def test_what_uncertainty_rejects_does_not_pull_at_its_surroundings(pair, measur
     assert right[1] > 1.1 * right[0]
     out = closed()[0] < 0.5
     sure, surer = sure_before[..., :2].sum(-1), sure_after[..., :2].sum(-1)
-    away = ~beside(out, 2)
-    assert bool((surer[away] >= 0.98 * sure[away]).all())  # structure of bytes, not of numbers
+    # with a reach, cells beside what is closed lose what its contour lent them
+    away = ~beside(out, 2) if reach else ~out
+    assert bool((surer[away] >= sure[away] - 1e-6).all())
     assert torch.allclose(surer[out], 0.2 * sure[out])
     patch = (slice(8, 12), slice(10, 16))  # what moves is still measured as it moves
     assert torch.equal(after[patch], before[patch])
