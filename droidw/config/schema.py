@@ -265,7 +265,7 @@ class DroidwConfig:
     global_solver: SolverConfig = field(
         default_factory=lambda: SolverConfig(lm=1e-6, ep=1e-4, cauchy=0.75)
     )
-    filler_solver: SolverConfig = field(default_factory=SolverConfig)
+    filler_solver: SolverConfig = field(default_factory=lambda: SolverConfig(cauchy=0.15))
 
     device: str = opt("auto", "auto, cpu, cuda, cuda:N")
     seed: int = opt(0, "seed of everything that draws numbers", ge=0)

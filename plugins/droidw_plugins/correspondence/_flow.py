@@ -123,19 +123,21 @@ class FlowCorrespondence:
     def _search(
         self, a: FlowFrame, b: FlowFrame, start: Array | None = None, fine: bool = False
     ) -> Array:
-        """Dense flow a -> b, [H,W,2] pixels; `fine` at the scale of global adjustment."""
+        """Dense flow a -> b, [H,W,2] pixels; `fine` as for global adjustment."""
         # An engine remembers that it was once given a start, and answers differently ever after:
         # one for each use, or the result would depend on which thread did what before.
-        scale = self.options.global_scale if fine else self.options.finest_scale
-        name = f"{'free' if start is None else 'started'}{scale}"
+        options = self.options
+        scale = options.global_scale if fine else options.finest_scale
+        refinement = options.global_refinement if fine else options.refinement
+        name = f"{'free' if start is None else 'started'}-{scale}-{refinement}"
         engine: Any = getattr(self._local, name, None)
         if engine is None:
             engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
             engine.setFinestScale(scale)
-            engine.setGradientDescentIterations(self.options.iterations)
-            engine.setVariationalRefinementIterations(self.options.refinement)
-            engine.setPatchSize(self.options.patch_size)
-            engine.setPatchStride(self.options.patch_stride)
+            engine.setGradientDescentIterations(options.iterations)
+            engine.setVariationalRefinementIterations(refinement)
+            engine.setPatchSize(options.patch_size)
+            engine.setPatchStride(options.patch_stride)
             setattr(self._local, name, engine)
         flow: Array = engine.calc(a.grey, b.grey, None if start is None else start.copy())
         return flow
@@ -203,7 +205,7 @@ class FlowCorrespondence:
 
         Args:
             a, b: frames. start_ab, start_ba: targets [h,w,2] to start from; None: free.
-            fine: at the scale of global adjustment.
+            fine: as for global adjustment.
             bridged: the frames without what moves, or themselves; what a second search finds
                 between these is taken where it is surer.
         """

@@ -21,7 +21,7 @@ class FlowOptions:
         metadata={"help": "finest pyramid level of the search (0: full size)", "ge": 0, "le": 3},
     )
     global_scale: int = field(
-        default=1,
+        default=0,
         metadata={"help": "the same for global bundle adjustment", "ge": 0, "le": 3},
     )
     iterations: int = field(
@@ -35,6 +35,10 @@ class FlowOptions:
     )
     refinement: int = field(
         default=3, metadata={"help": "variational refinement iterations", "ge": 0, "le": 20}
+    )
+    global_refinement: int = field(
+        default=1,
+        metadata={"help": "the same for global bundle adjustment", "ge": 0, "le": 20},
     )
     consistency: float = field(
         default=0.5,
