@@ -15,16 +15,19 @@ from __future__ import annotations
 
 import argparse
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from droidw.eval.mask_files import read_mask
+from droidw.io.images import list_images, read_image
 from droidw.testing.scenes import Scene, SceneSpec
 
 Layer = list[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]
-"""Pictures [H,W,3] (BGR) of what moves, and the share [H,W] of each pixel that it covers."""
+"""Pictures [H,W,3] of what moves, and the share [H,W] of each pixel that it covers."""
 
 MOVERS = "composite_kitchen,composite_hospital,davis_parkour+davis_car-roundabout"
 ROOMS = (  # camera path, width, height, pictures per second
@@ -39,18 +42,16 @@ ROOMS = (  # camera path, width, height, pictures per second
 
 def read_layer(folder: Path, width: int, height: int, frames: int) -> Layer:
     """What moves in a clip, as large as the room's pictures, as many frames as asked for."""
-    pictures, masks = (sorted((folder / name).iterdir()) for name in ("rgb", "mask"))
-    if len(pictures) != len(masks) or len(pictures) < 2:
+    pictures, masks = (list_images(folder / name) for name in ("rgb", "mask"))
+    if len(pictures) != len(masks) or not pictures:
         raise SystemExit(f"{folder}: {len(pictures)} pictures and {len(masks)} masks")
-    there = list(range(len(pictures)))
-    turn = there + there[-2:0:-1]
-    order = [turn[k % len(turn)] for k in range(frames)]
-    made = {}
-    for k in set(order):
-        image = cv2.imread(str(pictures[k]))
-        covered = cv2.imread(str(masks[k]), cv2.IMREAD_GRAYSCALE).astype(np.float32) / 255
-        made[k] = middle(image.astype(np.float32), width, height), middle(covered, width, height)
-    return [made[k] for k in order]
+    there = []
+    for picture, mask in list(zip(pictures, masks, strict=True))[:frames]:
+        image, share = read_image(picture), read_mask(mask)
+        both = (middle(part.astype(np.float32), width, height) for part in (image, share))
+        there.append(tuple(both))
+    to_and_fro = there + there[-2:0:-1]
+    return [to_and_fro[k % len(to_and_fro)] for k in range(frames)]
 
 
 def middle(image: npt.NDArray[np.float32], width: int, height: int) -> npt.NDArray[np.float32]:
@@ -70,21 +71,21 @@ def paste(folder: Path, made: Path, layers: list[Layer]) -> float:
     for name in ("rgb.txt", "groundtruth.txt", "camera.txt"):
         shutil.copy(folder / name, made / name)
     shares = []
-    for k, path in enumerate(sorted((folder / "rgb").iterdir())):
-        image = cv2.imread(str(path)).astype(np.float32)
+    for k, path in enumerate(list_images(folder / "rgb")):
+        image = read_image(path).astype(np.float32)
         moving = np.zeros(image.shape[:2], bool)
         for layer in layers:
-            picture, share = layer[k]
-            image += share[..., None] * (picture - image)
+            mover, share = layer[k]
+            image += share[..., None] * (mover - image)
             moving |= share > 0.5
-        image = np.clip(np.rint(image), 0, 255)
-        cv2.imwrite(str(made / "rgb" / path.name), image.astype(np.uint8))
+        picture = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(made / "rgb" / path.name), picture[..., ::-1])
         cv2.imwrite(str(made / "mask" / path.name), moving.astype(np.uint8) * 255)
         shares.append(moving.mean())
     return float(np.mean(shares))
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Write the clips."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder of clips with masks")
@@ -92,7 +93,7 @@ def main() -> None:
     parser.add_argument("--movers", default=MOVERS, help=f"clips of DATA ({MOVERS})")
     parser.add_argument("--frames", type=int, default=160)
     parser.add_argument("--rooms", type=int, default=len(ROOMS), help="only the first so many")
-    asked = parser.parse_args()
+    asked = parser.parse_args(argv)
     if asked.out.exists():
         raise SystemExit(f"{asked.out} is there already; name another folder")
     movers = asked.movers.split(",")

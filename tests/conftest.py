@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 
 # Before torch, numpy or OpenCV are imported: sums in one order, and no more cores than needed.
 for _variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -67,6 +69,20 @@ def _checkout_stays_clean() -> Iterator[None]:
     if before is not None:
         new = sorted(_strangers() - before)
         assert not new, f"tests wrote into the checkout instead of tmp_path: {', '.join(new)}"
+
+
+@pytest.fixture(scope="session")
+def load_benchmark() -> Callable[[str], ModuleType]:
+    """`load_benchmark(name)`: the script benchmarks/NAME.py as a module."""
+
+    def call(name: str) -> ModuleType:
+        spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    return call
 
 
 def _strangers() -> set[str]:

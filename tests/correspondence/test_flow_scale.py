@@ -16,10 +16,15 @@ def room():
     return Scene(SceneSpec(208, 160, 12, 30.0, 3, False, "handheld"))
 
 
-def test_global_adjustment_is_measured_finer_than_the_window(operator, frame, question, room):
-    part = operator()
+@pytest.fixture(scope="module")
+def pictures(frame, room):
+    """The first and the tenth of the room."""
     grey = [room.render(k).image.astype(np.float32).mean(-1) for k in (0, 9)]
-    pictures = [frame(k, picture) for k, picture in enumerate(grey)]
+    return [frame(k, picture) for k, picture in enumerate(grey)]
+
+
+def test_global_adjustment_is_measured_finer_than_the_window(operator, question, pictures, room):
+    part = operator()
     asked = replace(question(part, pictures), informed=True)
     centres = asked.payload(0).centres.astype(np.float64)
     truth = room.correspond(0, 9, centres)
@@ -37,10 +42,7 @@ def test_global_adjustment_is_measured_finer_than_the_window(operator, frame, qu
     assert fine < 0.1  # pixels
 
 
-def test_scales_do_not_share_an_engine(operator, frame, question, room):
-    grey = [room.render(k).image.astype(np.float32).mean(-1) for k in (0, 6)]
-    pictures = [frame(k, picture) for k, picture in enumerate(grey)]
-
+def test_scales_do_not_share_an_engine(operator, question, pictures):
     def targets(*purposes, **options):
         part = operator(**options)
         asked = replace(question(part, pictures), informed=True)

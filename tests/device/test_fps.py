@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-from pathlib import Path
 
-FILE = Path(__file__).resolve().parents[2] / "benchmarks" / "fps.py"
-
-
-def test_a_tiny_run(monkeypatch, capsys):
+def test_a_tiny_run(monkeypatch, capsys, load_benchmark):
     monkeypatch.setenv("DROIDW_WEIGHTS", "")  # put back afterwards
-    spec = importlib.util.spec_from_file_location("fps", FILE)
-    bench = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(bench)
-    record = bench.main(
+    record = load_benchmark("fps").main(
         ["--preset", "droid-slam", "--size", "96x64", "--frames", "9", "--every", "3",
          "--repeats", "1", "threads=1", "ba=torch"]
     )  # fmt: skip

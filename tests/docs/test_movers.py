@@ -1,19 +1,11 @@
 """benchmarks/movers.py pastes what its masks show, and leaves the rest of the room alone."""
 
-import importlib.util
-import sys
-from pathlib import Path
-
 import cv2
 import numpy as np
 
-FILE = Path(__file__).resolve().parents[2] / "benchmarks" / "movers.py"
 
-
-def test_rooms_are_covered_by_what_the_masks_show(tmp_path, monkeypatch):
-    spec = importlib.util.spec_from_file_location("movers", FILE)
-    movers = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(movers)
+def test_rooms_are_covered_by_what_the_masks_show(tmp_path, monkeypatch, load_benchmark):
+    movers = load_benchmark("movers")
     clip = tmp_path / "data" / "clip"
     for name in ("rgb", "mask"):
         (clip / name).mkdir(parents=True)
@@ -24,10 +16,8 @@ def test_rooms_are_covered_by_what_the_masks_show(tmp_path, monkeypatch):
         cv2.imwrite(str(clip / "mask" / f"{k}.png"), mask)
     out = tmp_path / "out"
     monkeypatch.setattr(movers, "ROOMS", (("forward", 64, 48, 10.0),))
-    argv = ["movers.py", str(tmp_path / "data"), str(out), "--movers", "clip", "--frames", "5"]
-    monkeypatch.setattr(sys, "argv", argv)
 
-    movers.main()
+    movers.main([str(tmp_path / "data"), str(out), "--movers", "clip", "--frames", "5"])
 
     still, moving = out / "room0_forward", out / "room0_forward_moving"
     assert not (still / "mask").exists()
