@@ -21,6 +21,7 @@ from droidw_plugins.correspondence._flow_information import (
     trust,
 )
 from droidw_plugins.correspondence._flow_mask import grown, surer, without
+from droidw_plugins.correspondence._flow_polish import polished
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Track
 
@@ -183,8 +184,10 @@ class FlowCorrespondence:
         return agreement.astype(np.float32)
 
     def one_way(self, a: FlowFrame, b: FlowFrame) -> Edge:
-        """Edge a -> b without the way back."""
-        moved, agrees = self._one_way(a, b, self._search)
+        """Edge a -> b without the way back, exact at full size."""
+        found, _ = self._one_way(a, b, self._search)
+        moved = polished(a.grey, b.grey, a.centres, found, self.options.fill_window)
+        agrees = self._agreement(a, b, moved)
         confidence = information(a, agrees, agrees, self.options)
         target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, None)

@@ -40,6 +40,15 @@ class FlowOptions:
         default=1,
         metadata={"help": "the same for global bundle adjustment", "ge": 0, "le": 20},
     )
+    fill_window: int = field(
+        default=9,
+        metadata={
+            "help": "width of the windows in which frames between keyframes are matched again, at "
+            "full size (below 3: as the search left them)",
+            "ge": 0,
+            "le": 31,
+        },
+    )
     consistency: float = field(
         default=0.5,
         metadata={"help": "forward-backward error at which confidence halves", "gt": 0.0},
