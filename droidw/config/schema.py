@@ -157,7 +157,13 @@ class FrontendConfig:
 class BackendConfig:
     """Global bundle adjustment after tracking."""
 
-    passes: list[int] = opt([2, 2, 2], "update steps of each global pass")
+    passes: list[int] = opt([2, 2, 2, 2], "update steps of each global pass")
+    wide_start: float = opt(
+        16.0,
+        "how many times wider than `global_solver.cauchy` the kernel of the first of several "
+        "passes is: what has broken off is drawn back before its matches are given up",
+        ge=1,
+    )
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)

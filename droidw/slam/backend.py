@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -58,7 +59,11 @@ class Backend:
         phase = self.config.schedule["global"]
         total = sum(options.passes)
         done = edges = 0
+        wide = self._begins_wide()
         for number, updates in enumerate(options.passes):
+            solver = self.config.global_solver
+            if wide and number == 0:
+                solver = replace(solver, cauchy=solver.cauchy * options.wide_start)
             if options.normalize and not bool(store["prior"].any()):
                 mean = store.disps.mean()
                 store.disps.div_(mean)
@@ -73,13 +78,12 @@ class Backend:
                 if "droid-w" in self.config.compat:
                     # as published: enlarged before the bundle adjustment of the same step
                     shown = store.disps.clone()
-                self.optimiser.update(
-                    graph, session, phase, self.config.global_solver, first_free=1
-                )
+                self.optimiser.update(graph, session, phase, solver, first_free=1)
                 done += 1
                 tell(done, total)
             edges = len(graph)
-            if number == 0 and self.config.camera.refine_focal and len(store) >= MIN_KEYFRAMES:
+            settled = number == int(wide)
+            if settled and self.config.camera.refine_focal and len(store) >= MIN_KEYFRAMES:
                 self.focal = refine_focal(
                     self.optimiser,
                     graph,
@@ -91,6 +95,16 @@ class Backend:
             if number == len(options.passes) - 1:
                 self._upsample(session, shown)
         return edges
+
+    def _begins_wide(self) -> bool:
+        """Whether the first pass has a wider kernel than those after it.
+
+        Where the path has broken, the matches across the break are all that can mend it, and they
+        are the very ones that a narrow kernel gives up.
+        """
+        options = self.config.backend
+        kernel = self.config.global_solver.cauchy > 0 and options.wide_start > 1
+        return kernel and len(options.passes) > 1
 
     def _upsample(self, session: EdgeSession, disps: Tensor) -> None:
         """Keep full-size maps where correspondence can make them."""

@@ -1,0 +1,118 @@
+"""Global bundle adjustment: a path that has broken is mended before its matches are given up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.config.schema import CameraConfig, DroidwConfig
+from droidw.geometry.camera import Grid
+from droidw.geometry.projective import pixel_grid, reproject
+from droidw.geometry.se3 import exp, mul
+from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.interfaces.correspondence import EdgeUpdate
+from droidw.slam import backend as module
+from droidw.slam.backend import Backend
+from droidw.slam.optimise import Optimiser, Parts
+from droidw.slam.timing import Stopwatch
+from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
+
+H, W, COUNT, BROKEN = 8, 12, 9, 3
+LIARS = 0.2  # share of the cells that agree with the break
+
+
+@pytest.fixture
+def broken():
+    """`broken(cauchy=, focal=, **backend)`: a backend whose first keyframes have broken off.
+
+    And what tells its largest residual, cells. Measurements are exact, but that some of those
+    across the break agree with it, as matches do that follow what moves.
+    """
+    grid, intrinsics = Grid(H, W, 8, 3.5), torch.tensor([82.0, 82.0, 47.5, 31.5])
+    s = torch.linspace(0, 1, COUNT)
+    T_cw = exp(torch.stack([0.8 * s, 0.3 * s * s, 0.1 * s, 0.1 * s, 0.2 * s, 0.1 * s], 1))
+    x, y = pixel_grid(H, W).unbind(-1)
+    disps = torch.stack([0.6 + 0.2 * (0.6 * x + k).sin() + 0.1 * y.cos() for k in range(COUNT)])
+    off = exp(torch.tensor([0.1, -0.05, 0.0, 0.05, 0.1, 0.05])).expand(BROKEN, -1)
+
+    lies = torch.rand(H, W, generator=torch.Generator().manual_seed(0)) < LIARS
+    start = torch.cat([mul(off, T_cw[:BROKEN]), T_cw[BROKEN:]])
+
+    def measured(ii, jj, poses=T_cw):
+        return reproject(poses, disps, grid.intrinsics(intrinsics), ii, jj)
+
+    def answer(request):
+        ii, jj = torch.tensor(request.ii), torch.tensor(request.jj)
+        target, valid = measured(ii, jj)
+        wrong = ((ii < BROKEN) != (jj < BROKEN))[:, None, None] & lies
+        target = torch.where(wrong[..., None], measured(ii, jj, start)[0], target)
+        return EdgeUpdate(target, valid[..., None].float().expand_as(target).contiguous())
+
+    def call(cauchy=0.75, focal=False, **backend):
+        config = DroidwConfig(camera=CameraConfig(refine_focal=focal))
+        config.global_solver.cauchy = cauchy
+        config.backend = replace(config.backend, **backend)
+        store = KeyframeStore(grid, intrinsics.clone())
+        for k in range(COUNT):
+            blank = np.zeros((H * 8, W * 8, 3), np.uint8)
+            info = KeyframeInfo(k, k / 10, "", blank, None)
+            store.append(info, T_cw=start[k], disps=disps[k])
+        operator = SimpleNamespace(session=lambda purpose: SimpleNamespace(update=answer))
+        parts = Parts(None, None, None, TorchBundleAdjuster(), operator)
+        optimiser = Optimiser(store, parts, config.weighting, Stopwatch())
+
+        def residual():
+            ii, jj = torch.arange(COUNT - 1), torch.arange(1, COUNT)
+            target, valid = measured(ii, jj)
+            coords, _ = reproject(store.T_cw, store.disps, store.intrinsics, ii, jj)
+            return float(((coords - target).norm(dim=-1) * valid).mean(dim=(1, 2)).max())
+
+        return Backend(optimiser, config), residual
+
+    return call
+
+
+def run(backend):
+    assert backend.run(lambda done, total: None) > 0
+
+
+def test_a_wide_kernel_mends_what_a_narrow_one_leaves_broken(broken):
+    left = []
+    for wide in (1, 16):
+        backend, residual = broken(wide_start=wide)
+        before = residual()
+        run(backend)
+        left.append(residual())
+    assert before > 1.5  # cells
+    assert left[0] > 0.8 * before
+    assert left[1] < 0.02 * before
+
+
+@pytest.mark.parametrize(
+    "options", [{"passes": [6]}, {"passes": [3, 3], "cauchy": 0.0}], ids=["one pass", "no kernel"]
+)
+def test_one_pass_and_no_kernel_are_as_they_were(broken, options):
+    poses = []
+    for wide in (1, 16):
+        backend, _ = broken(wide_start=wide, **options)
+        run(backend)
+        poses.append(backend.optimiser.store.T_cw.clone())
+    assert torch.equal(*poses)
+
+
+@pytest.mark.parametrize(
+    ("options", "updates"), [({}, 4), ({"wide_start": 1.0}, 2), ({"cauchy": 0.0}, 2)]
+)
+def test_the_focal_length_is_looked_for_after_the_first_pass_that_is_not_wide(
+    broken, monkeypatch, options, updates
+):
+    backend, _ = broken(focal=True, passes=[2, 2, 2], **options)
+    told = []
+    monkeypatch.setattr(module, "MIN_KEYFRAMES", COUNT)
+    monkeypatch.setattr(module, "refine_focal", lambda *given: told.append("focal"))
+    backend.run(lambda done, total: told.append(done))
+    assert told.index("focal") == updates
