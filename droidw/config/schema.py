@@ -169,7 +169,7 @@ class BackendConfig:
     radius: int = opt(1, "neighbours always linked", ge=1)
     nms: int = opt(3, "suppression radius around chosen edges", ge=0)
     nms_shape: Literal["square", "diamond"] = opt(
-        "square",
+        "diamond",
         "what a chosen edge suppresses; diamond: as in the window, little near the diagonal",
     )
     normalize: bool = opt(
@@ -260,7 +260,7 @@ class DroidwConfig:
             "init_again": PhaseConfig(updates=0),
             "window": PhaseConfig(updates=1),
             "window_kept": PhaseConfig(updates=1),
-            "global": PhaseConfig(updates=0, learn=False, depth_prior=False),
+            "global": PhaseConfig(updates=0, iterations=4, learn=False, depth_prior=False),
             "fill": PhaseConfig(updates=0, learn=False, depth_prior=False),
         },
         metadata={

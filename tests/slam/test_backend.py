@@ -116,3 +116,14 @@ def test_the_focal_length_is_looked_for_after_the_first_pass_that_is_not_wide(
     monkeypatch.setattr(module, "refine_focal", lambda *given: told.append("focal"))
     backend.run(lambda done, total: told.append(done))
     assert told.index("focal") == updates
+
+
+def test_near_keyframes_keep_their_edges(broken):
+    edges = {}
+    for shape in ("square", "diamond"):
+        backend, _ = broken(nms_shape=shape)
+        edges[shape] = {(max(e), min(e)) for e in backend._edges()}
+    three_apart = {(k + 3, k) for k in range(COUNT - 3)}
+    assert three_apart <= edges["diamond"]
+    assert len(three_apart & edges["square"]) < len(three_apart) / 2
+    assert len(edges["diamond"]) < COUNT * (COUNT - 1) / 2  # far ones are still thinned
