@@ -1,19 +1,17 @@
-"""Global bundle adjustment: a path that has broken is mended before its matches are given up."""
+"""Global bundle adjustment: how it begins, and what its graph holds."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
 from droidw.config.schema import CameraConfig, DroidwConfig
 from droidw.geometry.camera import Grid
-from droidw.geometry.projective import pixel_grid, reproject
+from droidw.geometry.projective import reproject
 from droidw.geometry.se3 import exp, mul
-from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.slam import backend as module
 from droidw.slam.backend import Backend
@@ -26,17 +24,14 @@ LIARS = 0.2  # share of the cells that agree with the break
 
 
 @pytest.fixture
-def broken():
+def broken(arc, waves, stored):
     """`broken(cauchy=, focal=, **backend)`: a backend whose first keyframes have broken off.
 
     And what tells its largest residual, cells. Measurements are exact, but that some of those
     across the break agree with it, as matches do that follow what moves.
     """
     grid, intrinsics = Grid(H, W, 8, 3.5), torch.tensor([82.0, 82.0, 47.5, 31.5])
-    s = torch.linspace(0, 1, COUNT)
-    T_cw = exp(torch.stack([0.8 * s, 0.3 * s * s, 0.1 * s, 0.1 * s, 0.2 * s, 0.1 * s], 1))
-    x, y = pixel_grid(H, W).unbind(-1)
-    disps = torch.stack([0.6 + 0.2 * (0.6 * x + k).sin() + 0.1 * y.cos() for k in range(COUNT)])
+    T_cw, disps = arc(COUNT), waves(COUNT, H, W)
     off = exp(torch.tensor([0.1, -0.05, 0.0, 0.05, 0.1, 0.05])).expand(BROKEN, -1)
 
     lies = torch.rand(H, W, generator=torch.Generator().manual_seed(0)) < LIARS
@@ -56,11 +51,7 @@ def broken():
         config = DroidwConfig(camera=CameraConfig(refine_focal=focal))
         config.global_solver.cauchy = cauchy
         config.backend = replace(config.backend, **backend)
-        store = KeyframeStore(grid, intrinsics.clone())
-        for k in range(COUNT):
-            blank = np.zeros((H * 8, W * 8, 3), np.uint8)
-            info = KeyframeInfo(k, k / 10, "", blank, None)
-            store.append(info, T_cw=start[k], disps=disps[k])
+        store = stored(grid, intrinsics.clone(), start, disps)
         operator = SimpleNamespace(session=lambda purpose: SimpleNamespace(update=answer))
         parts = Parts(None, None, None, TorchBundleAdjuster(), operator)
         optimiser = Optimiser(store, parts, config.weighting, Stopwatch())

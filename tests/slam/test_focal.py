@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -14,7 +13,6 @@ from droidw.geometry import projective, se3
 from droidw.geometry.camera import Grid
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import neighbour_edges
-from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.slam.focal import minimise_with_prior, refine_focal
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.timing import Stopwatch
@@ -54,32 +52,35 @@ def test_energy_that_is_not_finite_ends_the_search(broken):
     assert x == 0.0 and len(tried) == 3
 
 
-def bench(wrong: float):
-    """An optimiser over 12 keyframes with exact measurements, and a focal length that is off."""
-    h, w, count = 12, 16, 12
-    grid = Grid(h, w, 8, 3.5)
-    true = torch.tensor([110.0, 110.0, 63.5, 47.5])
-    given = true * torch.tensor([wrong, wrong, 1.0, 1.0])
-    store = KeyframeStore(grid, given)
-    s = torch.linspace(0, 1, count)
-    across = (0.8 * (5 * s).sin(), 0.3 * (7 * s).cos(), 0.2 * s)
-    turn = (0.2 * s.cos(), 0.5 * (4 * s).sin(), 0.1 * s)
-    T_cw = se3.exp(torch.stack((*across, *turn), 1))
-    x, y = projective.pixel_grid(h, w).unbind(-1)
-    disps = torch.stack([0.6 + 0.2 * (0.6 * x + k).sin() + 0.1 * y.cos() for k in range(count)])
-    for k in range(count):
-        blank = np.zeros((h * 8, w * 8, 3), np.uint8)
-        store.append(KeyframeInfo(k, k / 10, "", blank, None), T_cw=T_cw[k], disps=disps[k])
-    graph = FactorGraph(h, w, store.device)
-    graph.add(neighbour_edges(count, 3))
-    ii, jj = graph.index(graph.select())
-    graph.target[:], valid = projective.reproject(T_cw, disps, grid.intrinsics(true), ii, jj)
-    graph.confidence[:] = valid[..., None].float()
-    parts = Parts(None, None, None, TorchBundleAdjuster(), None)
-    return Optimiser(store, parts, WeightingConfig(), Stopwatch()), graph, true
+@pytest.fixture
+def bench(waves, stored):
+    """`bench(wrong=)`: an optimiser over 12 keyframes with exact measurements, and a focal length
+    that is `wrong` times the true one.
+    """
+
+    def make(wrong):
+        h, w, count = 12, 16, 12
+        grid = Grid(h, w, 8, 3.5)
+        true = torch.tensor([110.0, 110.0, 63.5, 47.5])
+        given = true * torch.tensor([wrong, wrong, 1.0, 1.0])
+        s = torch.linspace(0, 1, count)
+        across = (0.8 * (5 * s).sin(), 0.3 * (7 * s).cos(), 0.2 * s)
+        turn = (0.2 * s.cos(), 0.5 * (4 * s).sin(), 0.1 * s)
+        T_cw = se3.exp(torch.stack((*across, *turn), 1))
+        disps = waves(count, h, w)
+        store = stored(grid, given, T_cw, disps)
+        graph = FactorGraph(h, w, store.device)
+        graph.add(neighbour_edges(count, 3))
+        ii, jj = graph.index(graph.select())
+        graph.target[:], valid = projective.reproject(T_cw, disps, grid.intrinsics(true), ii, jj)
+        graph.confidence[:] = valid[..., None].float()
+        parts = Parts(None, None, None, TorchBundleAdjuster(), None)
+        return Optimiser(store, parts, WeightingConfig(), Stopwatch()), graph, true
+
+    return make
 
 
-def test_a_wrong_focal_length_is_found_from_exact_measurements():
+def test_a_wrong_focal_length_is_found_from_exact_measurements(bench):
     optimiser, graph, true = bench(wrong=1.08)
     camera = CameraConfig(focal_trust=0.0)
     found = refine_focal(optimiser, graph, PHASE, SOLVER, camera, known=True)
@@ -90,13 +91,13 @@ def test_a_wrong_focal_length_is_found_from_exact_measurements():
     assert torch.equal(store.image_intrinsics[2:], true[2:])
 
 
-def test_a_right_focal_length_stays():
+def test_a_right_focal_length_stays(bench):
     optimiser, graph, _ = bench(wrong=1.0)
     found = refine_focal(optimiser, graph, PHASE, SOLVER, CameraConfig(), known=True)
     assert found.factor == pytest.approx(1.0, abs=0.003)
 
 
-def test_a_guess_moves_where_a_calibration_holds():
+def test_a_guess_moves_where_a_calibration_holds(bench):
     factors = []
     for known in (True, False):
         optimiser, graph, _ = bench(wrong=1.08)
@@ -109,7 +110,7 @@ def test_a_guess_moves_where_a_calibration_holds():
     assert factors[0] < factors[1]
 
 
-def test_the_search_gives_up_no_measurement():
+def test_the_search_gives_up_no_measurement(bench):
     found = []
     for cauchy in (0.0, 0.05):
         optimiser, graph, _ = bench(wrong=1.08)

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 import torch
 
 from droidw.config.schema import PhaseConfig, SolverConfig, WeightingConfig
 from droidw.geometry.camera import Grid
-from droidw.geometry.projective import pixel_grid, reproject
+from droidw.geometry.projective import reproject
 from droidw.geometry.se3 import exp, inv, log, mul
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import neighbour_edges
-from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.slam.locate import locate
 from droidw.slam.optimise import Optimiser, Parts
@@ -30,23 +28,16 @@ def robust(cauchy: float) -> SolverConfig:
 
 
 @pytest.fixture
-def spoilt():
+def spoilt(arc, waves, stored):
     """True poses, and an optimiser some way off them, where half of each far edge is wrong.
 
     Wrong all alike, as by one tile of a wall, so that no sum over directions helps.
     """
     grid, intrinsics = Grid(H, W, 8, 3.5), torch.tensor([110.0, 110.0, 63.5, 47.5])
-    store = KeyframeStore(grid, intrinsics)
-    s = torch.linspace(0, 1, COUNT)
-    T_cw = exp(torch.stack([0.8 * s, 0.3 * s * s, 0.1 * s, 0.1 * s, 0.2 * s, 0.1 * s], 1))
-    x, y = pixel_grid(H, W).unbind(-1)
-    disps = torch.stack([0.6 + 0.2 * (0.6 * x + k).sin() + 0.1 * y.cos() for k in range(COUNT)])
+    T_cw, disps = arc(COUNT), waves(COUNT, H, W)
     off = exp(0.01 * torch.randn(COUNT, 6, generator=torch.Generator().manual_seed(1)))
     off[:2] = exp(torch.zeros(2, 6))  # both are held, and with them the scale
-    for k in range(COUNT):
-        blank = np.zeros((H * 8, W * 8, 3), np.uint8)
-        info = KeyframeInfo(k, k / 10, "", blank, None)
-        store.append(info, T_cw=mul(off[k], T_cw[k]), disps=disps[k])
+    store = stored(grid, intrinsics, mul(off, T_cw), disps)
     graph = FactorGraph(H, W, store.device)
     graph.add(neighbour_edges(COUNT, 3))
     ii, jj = graph.index(graph.select())

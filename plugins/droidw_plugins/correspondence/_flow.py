@@ -58,7 +58,7 @@ class FlowCorrespondence:
         self._lock = threading.Lock()
         self._latest: tuple[tuple[int, int], Array] | None = None
         self._full: OrderedDict[tuple[int, int], Array] = OrderedDict()
-        self._grid: OrderedDict[tuple[int, int], tuple[Array, Array]] = OrderedDict()
+        self._grid: OrderedDict[tuple[int, int], Array] = OrderedDict()
         self._pairs: OrderedDict[tuple[Hashable, ...], tuple[Edge, Edge]] = OrderedDict()
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
@@ -99,7 +99,8 @@ class FlowCorrespondence:
         start = None if self._track is None else self._track.ahead(reference, current)
         flow = self._search(reference, current, start)
         self._latest = (reference.index, current.index), flow
-        motion = self._motion(*self._one_way(reference, current, lambda a, b: flow), reference)
+        moved = self._moved(reference, current, lambda a, b: flow)
+        motion = self._motion(moved, self._agreement(reference, current, moved), reference)
         known = motion.matched > _TRACKED
         self._track = Track.after(self._track, reference, current, flow) if known else None
         return motion
@@ -149,25 +150,24 @@ class FlowCorrespondence:
             flow = self._full.get((a.index, b.index))
         return self._search(a, b) if flow is None else flow
 
-    def _one_way(
+    def _moved(
         self, a: FlowFrame, b: FlowFrame, search: Callable[[FlowFrame, FlowFrame], Array]
-    ) -> tuple[Array, Array]:
-        """Displacement [h,w,2] px at the cells and brightness agreement [h,w] in [0,1]."""
+    ) -> Array:
+        """Displacement [h,w,2] px at the cells."""
         key = (a.index, b.index)
         with self._lock:
             known = self._grid.get(key)
         if known is not None:
             return known
         moved = sample(search(a, b), a.centres)
-        agrees = self._agreement(a, b, moved)
         with self._lock:
-            self._grid[key] = (moved, agrees)
+            self._grid[key] = moved
             while len(self._grid) > _GRID_FIELDS:
                 self._grid.popitem(last=False)
-        return moved, agrees
+        return moved
 
     def _agreement(self, a: FlowFrame, b: FlowFrame, moved: Array) -> Array:
-        """Agreement in brightness at both ends of the flow, and 0 outside the picture."""
+        """Agreement [h,w] in brightness at both ends of the flow, and 0 outside the picture."""
         there = a.centres + moved
         height, width = a.grey.shape
         inside = (
@@ -185,7 +185,7 @@ class FlowCorrespondence:
 
     def one_way(self, a: FlowFrame, b: FlowFrame) -> Edge:
         """Edge a -> b without the way back, exact at full size."""
-        found, _ = self._one_way(a, b, self._search)
+        found = self._moved(a, b, self._search)
         moved = polished(a.grey, b.grey, a.centres, found, self.options.fill_window)
         agrees = self._agreement(a, b, moved)
         confidence = information(a, agrees, agrees, self.options)
