@@ -102,6 +102,12 @@ class SolverConfig:
     cauchy: float = opt(
         0.0, "residual in grid cells at which a Cauchy kernel halves a weight (0: none)", ge=0
     )
+    cauchy_tuning: float = opt(
+        0.0,
+        "makes that kernel follow what was measured: this many times the median residual wide, "
+        "`cauchy` at most (0: always `cauchy`)",
+        ge=0,
+    )
     guard: bool = opt(False, "shorten or reject a step that raises the energy")
 
 
@@ -183,6 +189,7 @@ class FillerConfig:
     """Poses of the frames that are not keyframes."""
 
     updates: int = opt(2, "motion-only update steps per batch", ge=0)
+    keyframes: int = opt(2, "keyframes on either side that a frame is measured from", ge=1)
     batch: int = opt(16, "frames per batch", ge=1)
     cache_mb: int = opt(
         512, "memory for what correspondence keeps of frames; beyond it they are read again", ge=0
@@ -261,7 +268,7 @@ class DroidwConfig:
             "window": PhaseConfig(updates=1),
             "window_kept": PhaseConfig(updates=1),
             "global": PhaseConfig(updates=0, iterations=4, learn=False, depth_prior=False),
-            "fill": PhaseConfig(updates=0, learn=False, depth_prior=False),
+            "fill": PhaseConfig(updates=0, iterations=8, learn=False, depth_prior=False),
         },
         metadata={
             "help": "phases: init_blind, init, init_again, window, window_kept, global, fill"
@@ -269,9 +276,11 @@ class DroidwConfig:
     )
     solver: SolverConfig = field(default_factory=lambda: SolverConfig(cauchy=0.15))
     global_solver: SolverConfig = field(
-        default_factory=lambda: SolverConfig(lm=1e-6, ep=1e-4, cauchy=0.75)
+        default_factory=lambda: SolverConfig(lm=1e-6, ep=1e-4, cauchy=0.75, cauchy_tuning=5.0)
     )
-    filler_solver: SolverConfig = field(default_factory=lambda: SolverConfig(cauchy=0.15))
+    filler_solver: SolverConfig = field(
+        default_factory=lambda: SolverConfig(cauchy=0.15, cauchy_tuning=0.5)
+    )
 
     device: str = opt("auto", "auto, cpu, cuda, cuda:N")
     seed: int = opt(0, "seed of everything that draws numbers", ge=0)

@@ -18,7 +18,7 @@ from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from droidw.config.schema import DroidwConfig
+    from droidw.config.schema import DroidwConfig, SolverConfig
     from droidw.interfaces.correspondence import EdgeSession
     from droidw.slam.optimise import Optimiser
 
@@ -61,9 +61,7 @@ class Backend:
         done = edges = 0
         wide = self._begins_wide()
         for number, updates in enumerate(options.passes):
-            solver = self.config.global_solver
-            if wide and number == 0:
-                solver = replace(solver, cauchy=solver.cauchy * options.wide_start)
+            solver = self._solver(number, wide)
             if options.normalize and not bool(store["prior"].any()):
                 mean = store.disps.mean()
                 store.disps.div_(mean)
@@ -95,6 +93,18 @@ class Backend:
             if number == len(options.passes) - 1:
                 self._upsample(session, shown)
         return edges
+
+    def _solver(self, number: int, wide: bool) -> SolverConfig:
+        """The solver of one pass; its kernel narrows from pass to pass.
+
+        One that follows the median residual is too narrow to mend what has broken off, as long as
+        most of the path is sound. So the last passes alone have it.
+        """
+        solver, last = self.config.global_solver, len(self.config.backend.passes) - 1
+        if wide and number == 0:
+            wider = solver.cauchy * self.config.backend.wide_start
+            return replace(solver, cauchy=wider, cauchy_tuning=0.0)
+        return replace(solver, cauchy_tuning=0.0) if number == int(wide) < last else solver
 
     def _begins_wide(self) -> bool:
         """Whether the first pass has a wider kernel than those after it.

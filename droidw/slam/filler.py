@@ -75,7 +75,7 @@ class Filler:
             self.optimiser,
             [encoded.payload for encoded in batch],
             start,
-            [sorted(set(self._sources(encoded.frame.time))) for encoded in batch],
+            [self._sources(encoded.frame.time) for encoded in batch],
             self._gates,
             updates=updates,
             iterations=self.config.schedule["fill"].iterations,
@@ -83,7 +83,10 @@ class Filler:
         )
 
     def _sources(self, time: float) -> list[int]:
+        """Keyframes on either side of `time`; at the last one, those behind it and one more."""
         before, after = self.neighbours(time)
-        if before == after and before > 0 and self.config.frontend.predict != "hold":
-            return [before - 1, before]
-        return [before, after]
+        count = self.config.filler.keyframes
+        first, end = before - count + 1, after + count
+        if before == after and self.config.frontend.predict != "hold":
+            first, end = before - count, after + 1
+        return list(range(max(first, 0), min(end, len(self._times))))

@@ -11,8 +11,9 @@ from torch import Tensor
 from droidw.geometry.projective import depth_there, reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
+from droidw.solve.kernel import redescended
 from droidw.solve.problem import BAProblem
-from droidw.solve.weights import redescended, residual_weights
+from droidw.solve.weights import residual_weights
 
 if TYPE_CHECKING:
     from droidw.config.schema import SolverConfig
@@ -97,7 +98,9 @@ def locate(
                     huber=solver.huber or None,
                     pairs=pairs,
                 )
-                T_cw = optimiser.parts.ba.step(redescended(problem, solver.cauchy)).T_cw
+                # each frame has a kernel of its own width
+                problem = redescended(problem, solver, jj - len(used), len(payloads))
+                T_cw = optimiser.parts.ba.step(problem).T_cw
     return T_cw[len(used) :]
 
 

@@ -14,8 +14,9 @@ from droidw.geometry.projective import reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.interfaces.uncertainty import Indices, UncertaintyView
+from droidw.solve.kernel import redescended
 from droidw.solve.problem import BAProblem, Report
-from droidw.solve.weights import gate, redescended, residual_weights
+from droidw.solve.weights import gate, residual_weights
 
 if TYPE_CHECKING:
     from droidw.config.schema import PhaseConfig, SolverConfig, WeightingConfig
@@ -234,7 +235,7 @@ class Optimiser:
             max_disp=weighting.max_disp or None,
             pairs=edges.pairs,
         )
-        step = self.parts.ba.step(redescended(problem, solver.cauchy))
+        step = self.parts.ba.step(redescended(problem, solver))
         self._note(step.report)
         self.cost = step.report.cost_before
         store.T_cw[low:] = step.T_cw

@@ -8,26 +8,20 @@ a match is far from what the poses predict.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch.nn import functional as F
 
-from droidw.geometry.projective import reproject
 from droidw.geometry.transfer import on_device
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from droidw.solve.problem import BAProblem
-
 __all__ = [
     "GateKind",
     "agreeing_share",
     "gate",
-    "redescend",
-    "redescended",
     "residual_weights",
     "unmasked",
 ]
@@ -116,40 +110,6 @@ def residual_weights(
     if valid is not None:
         weight = weight * valid[..., None].to(weight.dtype)
     return weight
-
-
-def redescend(weight: Tensor, residual: Tensor, scale: float) -> Tensor:
-    """Weights times those of a Cauchy kernel, `1 / (1 + (s / scale)^2)`.
-
-    The further a measurement lies from what the poses predict, the less it pulls: a Huber kernel
-    lets a wrong match pull with a constant force, and many that are wrong alike win. As a step of
-    iteratively reweighted least squares it needs nothing of a bundle adjustment backend.
-
-    Args:
-        weight: [E,h,w,2] or [E,h,w,3], information of the matches as in `BAProblem.weight`.
-        residual: [E,h,w,2] measured less predicted position, cells.
-        scale: s at which a weight halves, cells, > 0; s as of `BAProblem.huber`, so that a match
-            is judged in the directions in which it is known.
-    Returns:
-        The shape of `weight`, a fresh tensor. Where residual or weight is not finite, the weight is
-        as it was: bundle adjustment counts and drops those.
-    """
-    x, y = residual.unbind(-1)
-    energy = weight[..., 0] * x * x + weight[..., 1] * y * y
-    if weight.shape[-1] == 3:
-        energy = energy + 2.0 * weight[..., 2] * x * y
-    mean = 0.5 * (weight[..., 0] + weight[..., 1])
-    square = (energy / mean.clamp_min(torch.finfo(mean.dtype).tiny)).clamp_min(0.0)
-    factor = (1.0 + square / scale**2).reciprocal()
-    return weight * torch.where(torch.isfinite(factor), factor, 1.0)[..., None]
-
-
-def redescended(problem: BAProblem, scale: float) -> BAProblem:
-    """The problem with weights as `redescend` leaves them at its poses and depths; 0: itself."""
-    if scale == 0:
-        return problem
-    coords, _ = reproject(problem.T_cw, problem.disps, problem.intrinsics, problem.ii, problem.jj)
-    return replace(problem, weight=redescend(problem.weight, problem.target - coords, scale))
 
 
 def agreeing_share(residual: Tensor, weight: Tensor, scale: float, nothing: float = 0.0) -> Tensor:

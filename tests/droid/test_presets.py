@@ -19,7 +19,7 @@ PAPER = {
     "backend.passes": [7, 12], "backend.beta": 0.75, "backend.threshold": 25.0,
     "backend.radius": 1, "backend.nms": 5, "backend.nms_shape": "square",
     "backend.normalize": False, "backend.factors_per_keyframe": 6,
-    "filler.updates": 12, "filler.batch": 16,
+    "filler.updates": 12, "filler.keyframes": 1, "filler.batch": 16,
     "weighting.similarity": "raw",
     "weighting.gate": "rational", "weighting.slope": 45.0, "weighting.shift": 35.0,
     "weighting.floor": 0.1, "weighting.bidirectional": False,
@@ -34,9 +34,15 @@ PAPER = {
     "schedule.global": {
         "updates": 0, "iterations": 2, "learn": False, "weigh": True, "depth_prior": False,
     },
-    "solver": {"lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "guard": False},
-    "global_solver": {"lm": 1e-5, "ep": 1e-2, "huber": 0.0, "cauchy": 0.0, "guard": False},
-    "filler_solver": {"lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "guard": False},
+    "solver": {
+        "lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0, "guard": False,
+    },
+    "global_solver": {
+        "lm": 1e-5, "ep": 1e-2, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0, "guard": False,
+    },
+    "filler_solver": {
+        "lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0, "guard": False,
+    },
     "seed": 43, "compat": [], "camera.refine_focal": False,
 }  # fmt: skip
 OFF = {"learn": False, "weigh": False, "depth_prior": True}

@@ -1,4 +1,4 @@
-"""What wrong matches cost bundle adjustment, with a kernel that gives them up and without."""
+"""What wrong matches cost bundle adjustment, with a kernel that gives them up, and its width."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.slam.locate import locate
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.timing import Stopwatch
+from droidw.solve.kernel import redescended
+from droidw.solve.problem import BAProblem
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 
 H, W, COUNT = 12, 16, 6
@@ -92,3 +94,68 @@ def test_a_frame_is_located_in_spite_of_them(spoilt):
         )
         left.append(apart(found, T_cw[last:]))
     assert left[1] < 0.2 * left[0]
+
+
+@pytest.fixture
+def problem(arc, waves) -> BAProblem:
+    """Four frames on an arc, every match right but for a tenth that follows something else."""
+    T_cw, disps = arc(4), waves(4, 9, 12)
+    intrinsics = torch.tensor([14.0, 14.0, 5.5, 4.0])
+    ii, jj = torch.tensor([0, 0, 1, 2]), torch.tensor([1, 2, 3, 3])
+    target, valid = reproject(T_cw, disps, intrinsics, ii, jj)
+    target += 0.01 * torch.randn(target.shape, generator=torch.Generator().manual_seed(0))
+    target[:, :1] += 0.5
+    return BAProblem(
+        T_cw=T_cw,
+        disps=disps,
+        intrinsics=intrinsics,
+        ii=ii,
+        jj=jj,
+        target=target,
+        weight=valid[..., None].expand(*valid.shape, 2).float(),
+        fixed=torch.tensor([True, True, False, False]),
+        damping=torch.zeros_like(disps),
+        pairs=list(zip(ii.tolist(), jj.tolist(), strict=True)),
+    )
+
+
+def kept(problem: BAProblem, solver: SolverConfig, **groups) -> tuple[float, float]:
+    """Shares of their weight that wrong and right matches keep."""
+    weight = redescended(problem, solver, **groups).weight / problem.weight.clamp_min(1e-9)
+    known = problem.weight > 0
+    return float(weight[:, :1][known[:, :1]].mean()), float(weight[:, 1:][known[:, 1:]].mean())
+
+
+def test_a_kernel_that_follows_is_as_narrow_as_matches_are_exact(problem) -> None:
+    wrong, right = kept(problem, SolverConfig(cauchy=0.75))
+    assert wrong > 0.4 and right > 0.99
+    wrong, right = kept(problem, SolverConfig(cauchy=0.75, cauchy_tuning=5.0))
+    assert wrong < 0.02 and right > 0.9
+
+
+def test_it_is_never_wider_than_the_other_and_as_wide_where_poses_are_far_off(problem) -> None:
+    fixed, follows = SolverConfig(cauchy=0.05), SolverConfig(cauchy=0.05, cauchy_tuning=50.0)
+    assert torch.allclose(redescended(problem, fixed).weight, redescended(problem, follows).weight)
+    problem.T_cw[2:, :3] += 0.5
+    fixed, follows = SolverConfig(cauchy=0.75), SolverConfig(cauchy=0.75, cauchy_tuning=5.0)
+    assert torch.allclose(redescended(problem, fixed).weight, redescended(problem, follows).weight)
+
+
+def test_matches_without_any_error_keep_their_weight(problem) -> None:
+    problem.target[:] = reproject(
+        problem.T_cw, problem.disps, problem.intrinsics, problem.ii, problem.jj
+    )[0]
+    solver = SolverConfig(cauchy=0.15, cauchy_tuning=0.5)
+    assert torch.allclose(redescended(problem, solver).weight, problem.weight)
+
+
+def test_edges_can_have_a_width_each(problem) -> None:
+    problem.target[3, 1:] += 0.3 * torch.sign(problem.target[3, 1:] - problem.target[3, 1:].mean())
+    solver = SolverConfig(cauchy=0.75, cauchy_tuning=2.0)
+    one = redescended(problem, solver).weight[3, 1:].mean()
+    each = redescended(problem, solver, group=problem.jj, groups=4).weight[3, 1:].mean()
+    assert each > 2 * one
+
+
+def test_no_kernel_leaves_the_problem_as_it_is(problem) -> None:
+    assert redescended(problem, SolverConfig(cauchy=0.0, cauchy_tuning=5.0)) is problem

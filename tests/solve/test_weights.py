@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from droidw.solve.weights import gate, redescend, residual_weights, unmasked
+from droidw.solve.weights import gate, residual_weights, unmasked
 
 
 def test_rational_gate_matches_the_published_table() -> None:
@@ -94,36 +94,6 @@ def test_one_row_of_cells_can_be_sampled() -> None:
         bidirectional=True,
     )
     assert weight.flatten().tolist() == [0.25, 0.25]
-
-
-def test_a_far_match_pulls_less_than_a_near_one() -> None:
-    residual = torch.zeros(1, 1, 4, 2, dtype=torch.float64)
-    residual[0, 0, :, 0] = torch.tensor([0.0, 0.5, 1.0, 5.0])
-    weight = redescend(torch.ones_like(residual), residual, 0.5)
-    assert weight[0, 0, :, 0].tolist() == pytest.approx([1.0, 0.5, 0.2, 1 / 101])
-    pull = weight[..., 0] * residual[..., 0]
-    assert pull.argmax() == 1
-    assert torch.equal(weight[..., 0], weight[..., 1])
-
-
-def test_a_match_is_judged_in_the_directions_in_which_it_is_known() -> None:
-    # an edge at 45 degrees: all is known across it, nothing along it
-    across = torch.tensor([0.5, 0.5, -0.5], dtype=torch.float64).expand(1, 1, 2, 3)
-    residual = torch.tensor([[[[2.0, 2.0], [0.5, -0.5]]]], dtype=torch.float64)
-    weight = redescend(across, residual, 1.0)
-    assert torch.equal(weight[0, 0, 0], across[0, 0, 0])  # slipped along the edge: no fault of it
-    # r^T W r = 0.5, and the mean of xx and yy is 0.5
-    assert torch.allclose(weight[0, 0, 1], 0.5 * across[0, 0, 1])
-
-
-def test_the_scale_of_weights_does_not_matter_and_nonsense_stays_to_be_counted() -> None:
-    residual = torch.tensor([[[[0.3, 0.4], [float("nan"), 0.0], [1.0, 1.0]]]])
-    weight = torch.tensor([[[[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]]])
-    once, small = redescend(weight, residual, 0.5), redescend(1e-6 * weight, residual, 0.5)
-    assert torch.allclose(small, 1e-6 * once)
-    assert once[0, 0].tolist() == [[0.5, 0.5], [1.0, 1.0], [0.0, 0.0]]
-    broken = redescend(torch.full_like(weight, float("nan")), residual, 0.5)
-    assert bool(torch.isnan(broken).all())
 
 
 def test_a_user_mask_reaches_the_cells_around_what_it_covers() -> None:
