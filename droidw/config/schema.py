@@ -157,6 +157,13 @@ class FrontendConfig:
         "which keyframe is dropped where too little moved: the newest, if near to the one before; "
         "middle: the last but two, if its neighbours are nearer than twice the threshold",
     )
+    again_below: float = opt(
+        0.72,
+        "agreement of all matches with poses and depths in the end below which the footage is "
+        "tracked once more, without what the first time was found to move (0: never, 1: always)",
+        ge=0,
+        le=1,
+    )
 
 
 @dataclass

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import random
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack
@@ -13,17 +11,9 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import cv2
-import numpy as np
 import torch
 
-from droidw.errors import (
-    DroidwError,
-    InputError,
-    Interrupted,
-    MissingRequirementError,
-    TrackingError,
-)
+from droidw.errors import DroidwError, InputError, Interrupted, TrackingError
 from droidw.eval.masks import score_folder
 from droidw.eval.metrics import score
 from droidw.events import Dispatcher, Progress, RunFailed, RunFinished, RunStarted
@@ -32,21 +22,23 @@ from droidw.io.prefetch import prefetch
 from droidw.io.tum import write_tum
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
+from droidw.run.again import Hidden, accepted, to_hide
 from droidw.run.cameras import choose_camera, open_masks
 from droidw.run.folder import FILES, prepare, withdraw, write_json, write_text
+from droidw.run.machine import run_device, settle
 from droidw.run.manifest import REPORTS, facts_of_setup, facts_of_time, facts_of_tracking
 from droidw.run.signals import Stop
 from droidw.run.sources import open_source
 from droidw.slam.frame import RunResult
 from droidw.slam.optimise import Parts
 from droidw.slam.system import Outcome, SlamSystem
+from droidw.slam.timing import Stopwatch
 
 if TYPE_CHECKING:
     from droidw.config.resolve import ResolvedConfig
     from droidw.interfaces.datasets import FrameSource
     from droidw.plugin.manager import Plugins
     from droidw.slam.frame import Frame, RawFrame
-    from droidw.slam.timing import Stopwatch
 
 __all__ = ["run"]
 
@@ -77,7 +69,7 @@ def run(
         MissingRequirementError: the device is not there.
         Interrupted: stopped by a signal, after what was tracked had been written.
     """
-    device = _device(resolved)
+    device = run_device(resolved)
     fresh = prepare(run_dir, overwrite)
     with ExitStack() as stack:
         # What is refused before anything was tracked leaves no folder that would be in the way.
@@ -105,6 +97,7 @@ class _Run:
         self.resolved, self.plugins, self.run_dir = resolved, plugins, run_dir
         self.config, self.device, self.stop, self.note = resolved.config, device, stop, note
         self.started = time.perf_counter()
+        self.sweeps = 1
         self.context = BuildContext(
             device=device,
             seed=self.config.seed,
@@ -114,7 +107,7 @@ class _Run:
             compat=frozenset(self.config.compat),
             disabled=plugins.disabled(),
         )
-        _seed(self.config.seed, self.config.threads)
+        settle(self.config.seed, self.config.threads)
         self.events = Dispatcher(
             [
                 (part.name, part.factory(options, self.context))
@@ -153,24 +146,30 @@ class _Run:
             self.events.warn(f"camera: {self.said}")
         self.masks = open_masks(self.config.input, source)
         self.context = replace(self.context, camera=camera)
-        parts = self._build()
         able = self.resolved.parts["correspondence"][0].capabilities
         threads = "threads" in able or (self.device.type == "cuda" and "gpu-threads" in able)
-        system = SlamSystem(
-            self.config,
-            parts,
-            rectify.camera,
-            self.device,
-            self.events,
-            threaded=threads,
-            focal_known=not guessed,
-        )
+        clock = Stopwatch()
+
+        def build(hidden: Hidden) -> SlamSystem:
+            return SlamSystem(
+                self.config,
+                self._build(),
+                rectify.camera,
+                self.device,
+                self.events,
+                threaded=threads,
+                focal_known=not guessed,
+                hidden=hidden,
+                clock=clock,
+            )
+
+        system = build({})
         self.built = time.perf_counter()
 
         passes = chain([chain([first], pictures)], iter(source.frames, None))
 
         def frames() -> Generator[Frame, None, None]:
-            return prefetch(self._prepared(next(passes), rectify, system.clock), ahead=8)
+            return prefetch(self._prepared(next(passes), rectify, clock), ahead=8)
 
         self.events.emit(
             RunStarted(self.config.input.source, self.run_dir, source.length, self._facts())
@@ -181,6 +180,8 @@ class _Run:
         if not system.frames:
             raise Interrupted("stopped by a signal before the first frame", self.stop.signum)
         outcome = system.finish(frames, brief=failure is not None or self.stop.signum > 0)
+        if failure is None and not self.stop.signum:
+            system, outcome = self._again(system, outcome, build, frames)
         if system.focal is not None and system.focal.factor != 1.0:
             self.said += (
                 f"; focal length refined to {system.focal.factor:.3f} times that, "
@@ -198,15 +199,13 @@ class _Run:
         while True:
             with clock("decode"):
                 raw = next(pending, None)
-                frame = None if raw is None else rectify(raw, self._mask(raw))
+                mask = None if raw is None or self.masks is None else self.masks.of(raw)
+                frame = None if raw is None else rectify(raw, mask)
                 if frame is not None and self.device.type == "cuda":
                     frame = replace(frame, image=frame.image.pin_memory())
             if frame is None:
                 return
             yield frame
-
-    def _mask(self, raw: RawFrame) -> Any:
-        return self.masks.of(raw) if self.masks is not None else None
 
     def _track(
         self, system: SlamSystem, frames: Callable[[], Generator[Frame, None, None]]
@@ -221,6 +220,36 @@ class _Run:
         finally:
             stream.close()
         return None
+
+    def _again(
+        self,
+        first: SlamSystem,
+        outcome: Outcome,
+        build: Callable[[Hidden], SlamSystem],
+        frames: Callable[[], Generator[Frame, None, None]],
+    ) -> tuple[SlamSystem, Outcome]:
+        """Track once more where the outcome is doubtful; what was found stays if that fails."""
+        hidden = to_hide(outcome, first.grid, self.config.frontend.again_below)
+        if not hidden:
+            return first, outcome
+        _log.info(
+            "%.0f %% of what was measured agrees with poses and depths: tracking once more, "
+            "without what was found to move (frontend.again_below=0 does not)",
+            100 * outcome.diagnosis.agreement,
+        )
+        second = build(hidden)
+        if self._track(second, frames) is not None or self.stop.signum:
+            self.events.warn("what was found the first time is kept")
+            return first, outcome
+        try:
+            found = second.finish(frames)
+        except Exception as error:  # noqa: BLE001 - the first outcome is as good as it was
+            self.events.warn(f"tracking once more failed: {error}")
+            return first, outcome
+        if not accepted(outcome, found):
+            return first, outcome
+        self.sweeps = 2
+        return second, found
 
     def _conclude(self, failure: Exception | None, result: RunResult, outcome: Outcome) -> None:
         written = f"{len(result.trajectory)} poses were written to {self.run_dir}/trajectory.tum"
@@ -336,6 +365,7 @@ class _Run:
         return {
             "source": self.config.input.source,
             **facts_of_tracking(system, source, outcome),
+            "sweeps": self.sweeps,
             **self._facts_of_time(system, outcome),
             "camera": self.said,
             **facts_of_setup(self.resolved, self.device, self.context.weights_dir, system.parts),
@@ -364,32 +394,3 @@ class _Run:
                 if (self.run_dir / name).exists() or name in later
             },
         }
-
-
-def _device(resolved: ResolvedConfig) -> torch.device:
-    """The device of the run; `auto` takes a GPU if every part makes use of it."""
-    wanted = resolved.config.device
-    if wanted == "auto":
-        usable = resolved.suits_gpu and torch.cuda.is_available()
-        return torch.device("cuda" if usable else "cpu")
-    device = torch.device(wanted)
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise MissingRequirementError(
-            f"device={wanted}: no GPU is visible to torch {torch.__version__}",
-            "run on the processor with --device cpu; see: droidw doctor",
-        )
-    return device
-
-
-def _seed(seed: int, threads: int) -> None:
-    """One seed, one order of operations: two runs give the same bytes on a CPU."""
-    random.seed(seed)
-    np.random.seed(seed)
-    torch.manual_seed(seed)
-    # Half of the cores for torch: the other half decodes and searches flow at the same time, and
-    # torch's threads wait for each other, which costs far more than they gain on a busy core.
-    torch.set_num_threads(max(1, (threads or os.cpu_count() or 1) // 2))
-    # What is float32 is float32 on a GPU too: cuDNN rounds it to ten bits of mantissa by default.
-    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
-    # OpenCV's own threads make optical flow depend on their number; droidw runs its own.
-    cv2.setNumThreads(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 import resource
 import sys
@@ -114,11 +115,12 @@ REPORTS = {
 
 def facts_of_tracking(system: SlamSystem, source: FrameSource, outcome: Outcome) -> dict[str, Any]:
     """How much was read and tracked, and with which working camera."""
-    camera = system.camera
+    camera, agreement = system.camera, outcome.diagnosis.agreement
     return {
         "frames": len(outcome.trajectory),
         "last_frame": system.last_index,
         "keyframes": len(outcome.keyframes),
+        "agreement": None if math.isnan(agreement) else round(agreement, 4),
         "skipped": source.skipped,
         "problems": source.problems[:100],
         "intrinsics": {

@@ -13,6 +13,7 @@ from droidw.geometry.projective import frame_distance
 from droidw.geometry.transfer import upload
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import backend_edges, frontend_edges
+from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ class Backend:
         focal_known: the focal length is a calibration, not a guess.
     Attributes:
         focal: what the search for a better focal length found, None without one.
+        agreement: share of what was measured last that agrees with poses and depths; NaN before.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class Backend:
         self.config = config
         self.focal_known = focal_known
         self.focal: FocalSearch | None = None
+        self.agreement = float("nan")
 
     def run(self, tell: Callable[[int, int], None]) -> int:
         """All passes of the configuration.
@@ -92,6 +95,8 @@ class Backend:
                 )
             if number == len(options.passes) - 1:
                 self._upsample(session, shown)
+                rows = list(range(edges))
+                self.agreement = explained_share(store, graph, rows, self.optimiser.gates())
         return edges
 
     def _solver(self, number: int, wide: bool) -> SolverConfig:

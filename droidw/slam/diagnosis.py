@@ -26,6 +26,8 @@ class Diagnosis:
         parallax: share of the flow between neighbouring keyframes that no turn of the camera
             explains, see `parallax`; NaN if unknown.
         points: points of the static cloud, None if unknown.
+        agreement: share of what global adjustment measured that agrees with poses and depths, see
+            `explained_share`; NaN if unknown.
     """
 
     frames: int
@@ -35,6 +37,7 @@ class Diagnosis:
     unmatched: bool = False
     parallax: float = float("nan")
     points: int | None = None
+    agreement: float = float("nan")
 
     def warnings(self) -> list[str]:
         """Sentences for the log and the report."""

@@ -30,6 +30,7 @@ class Encoded:
     Attributes:
         payload: of correspondence, of any frame. context: the same of a keyframe.
         features: [c,h,w]. prior: [h,w] inverse depth. Both only where they were made ahead.
+        plain: the same frame with nothing hidden, where something is while it is tracked.
         ready: when all of this is done on a GPU, see `Ahead`; None where it is done.
     """
 
@@ -38,6 +39,7 @@ class Encoded:
     context: Any = None
     features: Tensor | None = None
     prior: Tensor | None = None
+    plain: Encoded | None = None
     ready: Any = None
 
 

@@ -8,7 +8,7 @@ must be. On a CPU, and where nothing looks ahead, all of this does nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-__all__ = ["Ahead", "tensors_in"]
+__all__ = ["Ahead", "nbytes", "tensors_in"]
 
 
 class Ahead:
@@ -82,3 +82,12 @@ def tensors_in(value: Any) -> Iterator[Tensor]:
     elif is_dataclass(value) and not isinstance(value, type):
         for entry in fields(value):
             yield from tensors_in(getattr(value, entry.name))
+
+
+def nbytes(payload: object) -> int:
+    """Bytes of the arrays and tensors that a payload is or holds directly."""
+    if isinstance(payload, (list, tuple)):
+        values: Iterable[object] = payload
+    else:
+        values = (payload, *getattr(payload, "__dict__", {}).values())
+    return sum(int(getattr(value, "nbytes", 0)) for value in values)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -26,7 +27,8 @@ from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
 from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict, look_ahead
 from droidw.slam.optimise import Optimiser, Parts
-from droidw.slam.streams import Ahead
+from droidw.slam.records import keyframe_records
+from droidw.slam.streams import Ahead, nbytes
 from droidw.slam.timing import Stopwatch
 from droidw.solve.weights import unmasked
 
@@ -63,6 +65,9 @@ class SlamSystem:
         events: who hears what happens.
         threaded: whether correspondence may be called from another thread, ahead of time.
         focal_known: the focal length of `camera` is a calibration, not a guess.
+        hidden: by index of a frame, [H,W] True where its picture is ignored while tracking; global
+            adjustment sees it again.
+        clock: where the time of each stage is added up.
     Attributes:
         camera: the working camera, after `finish` with the focal length that was found.
         focal: what the search for that came to, None where there was none.
@@ -78,6 +83,8 @@ class SlamSystem:
         *,
         threaded: bool = False,
         focal_known: bool = True,
+        hidden: Mapping[int, npt.NDArray[np.bool_]] | None = None,
+        clock: Stopwatch | None = None,
     ) -> None:
         self.config = config
         self.parts = parts
@@ -85,7 +92,7 @@ class SlamSystem:
         self.focal: FocalSearch | None = None
         self._focal_known = focal_known
         self.events = events or Dispatcher()
-        self.clock = Stopwatch()
+        self.clock = clock or Stopwatch()
         op = parts.correspondence
         self.grid = Grid.of(camera.height, camera.width, op.stride, op.offset)
         # The published code takes depth and features from pixel 8 x + 3, but its rays from 8 x.
@@ -117,6 +124,9 @@ class SlamSystem:
         self._moved: list[float] = []
         self._matched: list[float] = []
         self._kept: dict[int, object] = {}
+        self._hidden = hidden or {}
+        # What global adjustment sees of keyframes of which something is hidden, by index.
+        self._plain: dict[int, tuple[object, Tensor]] = {}
         self._room = config.filler.cache_mb * 1e6
 
     @property
@@ -144,16 +154,33 @@ class SlamSystem:
     def _judge(self, frame: Frame) -> tuple[Encoded, Verdict]:
         """Encode a frame and say whether it becomes a keyframe; if it does, make all it needs."""
         with self._ahead.working():
-            current = self._encode(frame)
+            current = self._hide(self._encode(frame))
             with self.clock("motion filter"):
                 verdict = self._filter.judge(current)
             if verdict.keep:
-                context = self.parts.correspondence.context(current.payload, frame, self.grid)
-                current = replace(current, context=context)
+                current = self._with_context(current)
             if verdict.keep and self._pool is not None:
                 features, prior = self._features(frame), self._prior(frame)
                 current = replace(current, features=features, prior=prior)
             return replace(current, ready=self._ahead.ready()), verdict
+
+    def _hide(self, plain: Encoded) -> Encoded:
+        """The frame without what is hidden of it, and beside that as it is."""
+        hidden, frame = self._hidden.get(plain.frame.index), plain.frame
+        if hidden is None:
+            return plain
+        mask = torch.from_numpy(hidden)
+        mask = mask if frame.mask is None else mask | frame.mask
+        return replace(self._encode(replace(frame, mask=mask)), plain=plain)
+
+    def _with_context(self, current: Encoded) -> Encoded:
+        """What correspondence needs of a keyframe, too."""
+        op = self.parts.correspondence
+        plain = current.plain
+        if plain is not None:
+            plain = self._with_context(plain)
+        context = op.context(current.payload, current.frame, self.grid)
+        return replace(current, context=context, plain=plain)
 
     def _features(self, frame: Frame) -> Tensor:
         with self.clock("features"):
@@ -167,7 +194,9 @@ class SlamSystem:
     def _push(self, current: Encoded, verdict: Verdict) -> bool:
         frame = current.frame
         made = current.payload, current.context, current.features, current.prior
-        self._ahead.take(current.ready, made)
+        plain = current.plain
+        hidden = () if plain is None else (plain.payload, plain.context)
+        self._ahead.take(current.ready, made, hidden)
         self._times.append(frame.time)
         self._indices.append(frame.index)
         if verdict.motion is not None:
@@ -182,10 +211,11 @@ class SlamSystem:
 
     def _remember(self, current: Encoded) -> None:
         """Hold the payload for the filler while there is room; beyond, frames are read again."""
-        size = _nbytes(current.payload)
+        payload = (current.plain or current).payload
+        size = nbytes(payload)
         if size <= self._room:
             self._room -= size
-            self._kept[current.frame.index] = current.payload
+            self._kept[current.frame.index] = payload
 
     def _keyframe(self, current: Encoded, forced: bool) -> bool:
         number = self._append(current)
@@ -204,11 +234,10 @@ class SlamSystem:
         features = self._features(frame) if current.features is None else current.features
         prior = self._prior(frame) if current.prior is None else current.prior
         pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
-        if frame.mask is not None:
-            covered = self.grid.covered(upload(frame.mask, store.device))
-            known = {"unmasked": unmasked(covered)}
-        else:
-            known = {}
+        known = {"unmasked": self._unmasked(frame)}
+        if current.plain is not None:
+            plain = current.plain
+            self._plain[frame.index] = plain.context, self._unmasked(plain.frame)
         if self.optimiser.begins and not self.frontend.initialised:
             known["movable"] = self._movable(frame)
         number = store.append(
@@ -224,6 +253,12 @@ class SlamSystem:
         with self.clock("uncertainty"):
             parts.uncertainty.append(self.optimiser.view(), number)
         return number
+
+    def _unmasked(self, frame: Frame) -> Tensor:
+        """What the frame's mask leaves of each cell, [h,w] in [0,1]."""
+        if frame.mask is None:
+            return self.store.disps.new_ones(self.grid.height, self.grid.width)
+        return unmasked(self.grid.covered(upload(frame.mask, self.store.device)))
 
     def _movable(self, frame: Frame) -> Tensor:
         with self.clock("features"):
@@ -255,6 +290,7 @@ class SlamSystem:
             with self.clock("frontend"):
                 self.frontend.initialise()
         self.frontend.release()
+        self._reveal()
         found = diagnose(
             self.store, self._moved, self._matched, self.config.motion_filter.lost_below
         )
@@ -265,8 +301,10 @@ class SlamSystem:
                 backend = Backend(self.optimiser, self.config, self._focal_known)
                 backend.run(lambda done, total: self.events.emit(Progress("global", done, total)))
                 self._refined(backend.focal)
+                found = replace(found, agreement=backend.agreement)
         with self.clock("fill"):
             trajectory = self._trajectory(reread, quick=brief or found.still)
+        self._kept.clear()
         with self.clock("cloud"):
             records, cloud = self._records()
         if self._pool is not None:
@@ -275,6 +313,14 @@ class SlamSystem:
             share = parallax(self.store, self.optimiser.gates())
             found = replace(found, parallax=share, points=len(cloud.xyz))
         return Outcome(trajectory, records, cloud, found)
+
+    def _reveal(self) -> None:
+        """From now on nothing is hidden: matches are made with whole pictures."""
+        for number, info in enumerate(self.store.infos):
+            plain = self._plain.get(info.index)
+            if plain is not None:
+                info.payload, self.store["unmasked"][number] = plain
+        self._plain.clear()
 
     def _refined(self, focal: FocalSearch | None) -> None:
         """Take over the focal length that global adjustment found."""
@@ -347,31 +393,5 @@ class SlamSystem:
             published="droid-w" in self.config.compat,
         )
         weight = self.optimiser.gates()
-        T_wc = inv(store.T_cw.double()).cpu().numpy()
-        intrinsics = store.image_intrinsics.double().cpu().numpy()
-        records = tuple(
-            KeyframeRecord(
-                index=info.index,
-                time=info.time,
-                name=info.name,
-                image=info.image,
-                T_wc=T_wc[n],
-                intrinsics=intrinsics,
-                disp=store.disps[n].float().cpu().numpy().copy(),
-                depth_valid=valid[n].cpu().numpy(),
-                uncertainty=store["uncertainty"][n].float().cpu().numpy().copy(),
-                weight=weight[n].float().cpu().numpy().copy(),
-                disp_full=info.disp_full,
-            )
-            for n, info in enumerate(store.infos)
-        )
+        records = keyframe_records(store, valid, weight)
         return records, static_cloud(store, valid, weight, cloud)
-
-
-def _nbytes(payload: object) -> int:
-    """Bytes of the arrays and tensors that a payload is or holds directly."""
-    if isinstance(payload, (list, tuple)):
-        values: Iterable[object] = payload
-    else:
-        values = (payload, *getattr(payload, "__dict__", {}).values())
-    return sum(int(getattr(value, "nbytes", 0)) for value in values)

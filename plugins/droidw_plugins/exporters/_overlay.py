@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from droidw.geometry.spread import spread
 from droidw.slam.frame import KeyframeRecord
 
-__all__ = ["overlays", "spread"]
+__all__ = ["overlays"]
 
 _WARM = (255, 92, 20)  # RGB
 
@@ -46,19 +47,6 @@ def overlays(
         picture = np.asarray(blended, dtype=np.uint8)
         _stamp(picture, f"{keyframe.time - start:.2f} s  #{keyframe.index:06d}")
         yield picture
-
-
-def spread(
-    values: npt.NDArray[np.float32], stride: int, offset: float, size: tuple[int, int]
-) -> npt.NDArray[np.float32]:
-    """Values [h,w] of the grid at every pixel of a picture of `size` (width, height), bilinear."""
-    # Pixel (x, y) of the picture is taken from the grid at (x - offset) / stride.
-    to_grid = np.array([[1 / stride, 0, -offset / stride], [0, 1 / stride, -offset / stride]])
-    found = cv2.warpAffine(
-        values, to_grid, size,
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
-    return np.asarray(found, dtype=np.float32)
 
 
 def _stamp(picture: npt.NDArray[np.uint8], text: str) -> None:

@@ -104,17 +104,16 @@ class UncertaintyExporter:
         return written + ([self._write_video(result, folder)] if options.video else [])
 
     def _write_masks(self, result: RunResult, folder: Path) -> list[Path]:
+        from droidw.geometry.spread import closed
         from droidw_plugins.exporters._maps import write_map, write_scale
-        from droidw_plugins.exporters._overlay import spread
 
         height, width = result.keyframes[0].image.shape[:2]
         size, written = (width, height), []
         for keyframe in result.keyframes:
-            # A cell without a weight is not called moving.
-            weight = np.nan_to_num(keyframe.weight, nan=1.0).astype(np.float32)
-            share = spread(weight, result.stride, result.offset, size)
+            below = self._options.mask_below
+            mask = closed(keyframe.weight, result.stride, result.offset, size, below)
             path = folder / f"{keyframe.index:06d}.png"
-            write_map(path, np.where(share < self._options.mask_below, 255, 0).astype(np.uint8))
+            write_map(path, np.where(mask, 255, 0).astype(np.uint8))
             written.append(path)
         facts = {
             "mask": f"255: kept less than {self._options.mask_below:g} of its weight; 0: static",

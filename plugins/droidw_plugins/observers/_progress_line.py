@@ -60,6 +60,7 @@ class ProgressLine:
         self._stage = ""
         self._done = 0
         self._total: int | None = None
+        self._length: int | None = None
         self._keyframes = 0
         self._started = 0.0
         self._heard = 0.0
@@ -71,10 +72,13 @@ class ProgressLine:
         if not self._enabled:
             return
         if isinstance(event, RunStarted):
+            self._length = event.length
             self._begin("tracking", event.length)
         elif isinstance(event, FrameTracked):
-            if not self._stage:
-                self._begin("tracking", None)
+            if self._stage != "tracking":
+                # Nothing was said of a start; or the footage is tracked once more.
+                self._end()
+                self._begin("tracking", self._length, self._heard or None)
             self._keyframes = event.keyframes
             self._advance(event.done, self._total)
         elif isinstance(event, KeyframeAdded):
