@@ -16,8 +16,7 @@ import numpy.typing as npt
 from droidw.geometry.spread import closed
 
 if TYPE_CHECKING:
-    from droidw.geometry.camera import Grid
-    from droidw.slam.system import Outcome
+    from droidw.slam.system import Outcome, SlamSystem
 
 __all__ = ["Hidden", "accepted", "to_hide"]
 
@@ -30,28 +29,30 @@ _FEW = 0.02
 _SLACK = 0.05
 
 
-def to_hide(outcome: Outcome, grid: Grid, below: float) -> Hidden:
+def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden:
     """What is to be hidden while the footage is tracked again, by index of the frame.
 
     Args:
-        outcome: of the first time.
+        system, outcome: of the first time.
         below: agreement below which it is doubtful; 1 doubts all.
     Returns:
-        [H,W] of each keyframe; nothing where there is no doubt, or hardly anything to hide.
+        [H,W] of keyframes, where uncertainty leaves less than half; nothing where there is no
+        doubt, or hardly anything to hide. The user's masks are not in it: they hold anyway.
     """
     agreement = outcome.diagnosis.agreement
     # NaN, where nothing was adjusted, is no reason.
     if not (agreement < below or (below == 1.0 and agreement == 1.0)):
         return {}
+    store, grid = system.store, system.grid
+    size = (system.camera.width, system.camera.height)
+    gates = system.optimiser.learned_gates(range(len(store))).float().cpu().numpy()
     found = {}
-    for keyframe in outcome.keyframes:
-        height, width = keyframe.image.shape[:2]
-        size = (width, height)
-        mask = closed(keyframe.weight, grid.stride, grid.offset, size, _CLOSED)
+    for info, gate in zip(store.infos, gates, strict=True):
+        mask = closed(gate, grid.stride, grid.offset, size, _CLOSED)
         if mask.any():
-            found[keyframe.index] = mask
+            found[info.index] = mask
     covered = sum(float(mask.mean()) for mask in found.values())
-    return found if covered >= _FEW * len(outcome.keyframes) else {}
+    return found if covered >= _FEW * len(store) else {}
 
 
 def accepted(first: Outcome, second: Outcome) -> bool:

@@ -229,7 +229,7 @@ class _Run:
         frames: Callable[[], Generator[Frame, None, None]],
     ) -> tuple[SlamSystem, Outcome]:
         """Track once more where the outcome is doubtful; what was found stays if that fails."""
-        hidden = to_hide(outcome, first.grid, self.config.frontend.again_below)
+        hidden = to_hide(first, outcome, self.config.frontend.again_below)
         if not hidden:
             return first, outcome
         _log.info(

@@ -94,6 +94,23 @@ def test_terminal_keeps_one_line_a_stage() -> None:
     assert lines[2].startswith("poses of all frames  200 frames")
 
 
+def test_footage_that_is_tracked_once_more_has_a_line_of_its_own() -> None:
+    bench = Bench(io.StringIO())
+    bench.tell(RunStarted("clip.mp4", Path("run"), 20, {}))
+    for speed in (0.05, 0.1):
+        for i in range(20):
+            bench.tell(FrameTracked(i, i / 30, i + 1, 3), speed)
+        bench.tell(Progress("global", 1, 1), 1.0)
+        bench.tell(Progress("fill", 20, 20), 1.0)
+    bench.tell(RunFinished(None, Path("run"), None))  # type: ignore[arg-type]
+    lines = on_screen(bench.stream.getvalue())
+    tracking = [line for line in lines if line.startswith("tracking")]
+    assert [line.split("  ")[1] for line in tracking] == ["20 frames", "20 frames"]
+    assert "20.0 frames/s" in tracking[0]
+    assert "10.0 frames/s" in tracking[1]
+    assert sum(line.startswith("global") for line in lines) == 2
+
+
 def test_live_line_tells_speed_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
     bench = Bench(Terminal())

@@ -1,0 +1,191 @@
+"""Doubtful footage is tracked a second time, without what the first time was found to move."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from droidw.geometry.camera import Grid
+from droidw.run.again import accepted, to_hide
+from droidw.slam.diagnosis import Diagnosis
+from droidw.slam.system import SlamSystem
+
+LEARNED = ("features=cnn", "uncertainty=affine-softplus", "threads=1")
+AGAIN = (*LEARNED, "frontend.again_below=1")
+
+
+def outcome(agreement):
+    return SimpleNamespace(diagnosis=Diagnosis(30, 3, still=False, lost=0.0, agreement=agreement))
+
+
+class Store(list):
+    """Infos of keyframes, as a store has them."""
+
+    @property
+    def infos(self):
+        return list(self)
+
+
+@pytest.fixture
+def first():
+    """A system of three keyframes, of which uncertainty closes the left half of two."""
+    gates = torch.ones(3, 12, 16)
+    gates[:2, :, :8] = 0.1
+    return SimpleNamespace(
+        store=Store(SimpleNamespace(index=index) for index in (4, 7, 9)),
+        grid=Grid(12, 16, 8, 3.5),
+        camera=SimpleNamespace(width=128, height=96),
+        optimiser=SimpleNamespace(learned_gates=lambda nodes: gates[list(nodes)]),
+        gates=gates,
+    )
+
+
+def test_what_uncertainty_closes_is_hidden(first):
+    hidden = to_hide(first, outcome(0.5), below=0.7)
+    assert sorted(hidden) == [4, 7]
+    assert hidden[4].shape == (96, 128)
+    assert hidden[4][:, :56].all()
+    assert not hidden[4][:, 72:].any()
+
+
+@pytest.mark.parametrize("agreement", [0.7, 0.9, float("nan")])
+def test_without_doubt_nothing_is_hidden(first, agreement):
+    assert to_hide(first, outcome(agreement), below=0.7) == {}
+
+
+def test_one_doubts_all_and_zero_nothing(first):
+    assert to_hide(first, outcome(1.0), below=1.0)
+    assert to_hide(first, outcome(0.0), below=0.0) == {}
+
+
+def test_a_little_is_not_worth_the_time(first):
+    first.gates[:] = 1.0
+    first.gates[0, :2, :2] = 0.0
+    assert to_hide(first, outcome(0.5), below=0.7) == {}
+
+
+def test_the_second_outcome_stays_unless_it_agrees_much_less():
+    assert accepted(outcome(0.60), outcome(0.70))
+    assert accepted(outcome(0.60), outcome(0.58))
+    assert not accepted(outcome(0.60), outcome(0.50))
+    assert not accepted(outcome(0.60), outcome(float("nan")))
+
+
+def closing(system, share=0.4):
+    """Let uncertainty close a part of every keyframe, whatever it has learned."""
+    columns = int(share * system.grid.width)
+
+    def gates(nodes):
+        found = torch.ones(len(nodes), system.grid.height, system.grid.width)
+        found[..., :columns] = 0.0
+        return found
+
+    system.optimiser.learned_gates = gates
+
+
+@pytest.fixture
+def watched(monkeypatch):
+    """Every system that a run builds: what it is given to hide, and its keyframes."""
+    made = []
+    finish = SlamSystem.finish
+
+    def spy(self, reread, *, brief=False):
+        covered = [info.payload.covered for info in self.store.infos]
+        found = finish(self, reread, brief=brief)
+        revealed = [info.payload.covered for info in self.store.infos]
+        made.append(SimpleNamespace(system=self, covered=covered, revealed=revealed))
+        closing(self)
+        return found
+
+    monkeypatch.setattr(SlamSystem, "finish", spy)
+    return made
+
+
+def test_pictures_are_whole_again_in_global_adjustment(go, footage, watched):
+    ran = go(footage().folder, *AGAIN)
+    assert ran.code == 0, ran.err
+    assert ran.manifest["sweeps"] == 2
+    assert 0 < ran.manifest["agreement"] <= 1
+    one, two = watched
+    assert all(mask is None for mask in one.covered)
+    assert any(mask is not None for mask in two.covered)
+    assert all(mask is None for mask in two.revealed)
+    assert torch.equal(two.system.store["unmasked"], torch.ones_like(two.system.store["unmasked"]))
+    assert len(ran.poses) == 26
+
+
+def test_without_doubt_footage_is_tracked_once(go, footage, watched):
+    ran = go(footage().folder, *LEARNED, "frontend.again_below=0")
+    assert ran.code == 0, ran.err
+    assert ran.manifest["sweeps"] == len(watched) == 1
+
+
+def test_twice_gives_the_same_bytes(go, footage, watched):
+    one, two = (go(footage(name=name).folder, *AGAIN, to=f"to-{name}") for name in "ab")
+    assert one.manifest["sweeps"] == two.manifest["sweeps"] == 2
+    for name in ("trajectory.tum", "points.ply"):
+        assert (one.folder / name).read_bytes() == (two.folder / name).read_bytes(), name
+
+
+def test_a_users_mask_holds_in_both(go, footage, watched, tmp_path):
+    clip = footage()
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    mask = np.zeros((120, 160), np.uint8)
+    mask[:, 120:] = 255
+    for picture in sorted((clip.folder / "rgb").glob("*.png")):
+        cv2.imwrite(str(masks / picture.name), mask)
+    ran = go(clip.folder, *AGAIN, "--masks", masks)
+    assert ran.code == 0, ran.err
+    assert ran.manifest["sweeps"] == 2
+    two = watched[1]
+    assert all(mask[:, 121:].all() and mask[:, 10].any() for mask in two.covered[:1])
+    for mask in two.revealed:
+        assert mask[:, 121:].all()
+        assert not mask[:, :118].any()
+    assert float(two.system.store["unmasked"][..., 16:].max()) == 0.0
+
+
+@pytest.mark.parametrize("stage", ["track", "finish"])
+def test_what_was_found_first_stays_if_the_second_time_fails(
+    go, footage, watched, monkeypatch, stage
+):
+    plain = go(footage(name="a").folder, *LEARNED, "frontend.again_below=0", to="to-a")
+    real, calls = getattr(SlamSystem, stage), []
+
+    def second_time(self, *arguments, **options):
+        calls.append(self)
+        if len(calls) == 2:
+            raise RuntimeError("no more")
+        return real(self, *arguments, **options)
+
+    monkeypatch.setattr(SlamSystem, stage, second_time)
+    ran = go(footage(name="b").folder, *AGAIN, to="to-b")
+    assert ran.code == 0, ran.err
+    assert ran.manifest["sweeps"] == 1
+    assert "no more" in ran.warnings
+    assert (ran.folder / "trajectory.tum").read_bytes() == (
+        plain.folder / "trajectory.tum"
+    ).read_bytes()
+
+
+def test_an_outcome_that_agrees_much_less_is_left(go, footage, monkeypatch):
+    finish, calls = SlamSystem.finish, []
+
+    def worse(self, reread, *, brief=False):
+        found = finish(self, reread, brief=brief)
+        closing(self)
+        calls.append(self)
+        agreement = 0.6 if len(calls) == 1 else 0.3
+        return replace(found, diagnosis=replace(found.diagnosis, agreement=agreement))
+
+    monkeypatch.setattr(SlamSystem, "finish", worse)
+    ran = go(footage().folder, *AGAIN)
+    assert len(calls) == 2
+    assert ran.manifest["sweeps"] == 1
+    assert ran.manifest["agreement"] == 0.6
