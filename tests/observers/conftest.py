@@ -139,6 +139,8 @@ def full_manifest() -> dict:
         "frames": 300,
         "fps": 23.4,
         "peak_memory_mb": 812.3,
+        "agreement": 0.874,
+        "sweeps": 2,
         "preset": "cpu",
         "stages": {"decode": 1.2, "track": 8.4, "global": 2.1, "fill": 0.9, "export": 0.3},
         "camera": "from camera.txt: 640x480, fx 525.0, no distortion; reduced to 320x240.",

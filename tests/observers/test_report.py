@@ -171,11 +171,24 @@ def test_text_is_escaped(make_result: Make, tmp_path: Path) -> None:
     assert "i" not in page.links
 
 
+def test_the_page_says_how_much_agrees_and_that_it_was_tracked_twice(
+    make_result: Make, tmp_path: Path
+) -> None:
+    said = []
+    for facts in ({"agreement": 0.664, "sweeps": 2}, {"agreement": 0.874, "sweeps": 1}, {}):
+        result = make_result(tmp_path, frames=5, keyframes=1, manifest=facts)
+        said.append(checked(build_page(result, tmp_path, {})).text)
+    assert "66%" in said[0].replace(" ", "") and "tracked twice" in said[0]
+    assert "87%" in said[1].replace(" ", "") and "tracked twice" not in said[1]
+    assert "of matches agree" not in said[2]
+
+
 def test_a_strange_manifest_is_left_out(make_result: Make, tmp_path: Path) -> None:
     manifest = {
         "stages": {"track": float("nan"), "fill": "long", "global": -1}, "fps": float("inf"),
         "versions": [1, 2], "parts": {"ba": "torch"}, "files": "none",
         "config_yaml": None, "peak_memory_mb": True,
+        "agreement": "most", "sweeps": 3,
     }  # fmt: skip
     result = make_result(tmp_path, frames=5, keyframes=1, manifest=manifest)
     text = checked(build_page(result, tmp_path, {"ate_rmse": None})).text
