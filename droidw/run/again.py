@@ -1,13 +1,13 @@
 """Whether footage is tracked a second time, and what is hidden from tracking then.
 
 What moves pulls at the first searches of a run, before uncertainty has learned anything. Where the
-result does not hold together, the footage is tracked anew with the pictures of keyframes less what
-the first time was found to move.
+result does not hold together, the footage is tracked anew with pictures less what the first time
+was found to move.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from bisect import bisect_left, bisect_right
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,11 +16,13 @@ import numpy.typing as npt
 from droidw.geometry.spread import closed
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from droidw.slam.system import Outcome, SlamSystem
 
 __all__ = ["Hidden", "accepted", "to_hide"]
 
-Hidden = Mapping[int, npt.NDArray[np.bool_]]
+_Mask = npt.NDArray[np.bool_]
 
 # Share of its weight below which a pixel is hidden, and share of pixels that is worth the time.
 _CLOSED = 0.5
@@ -29,30 +31,57 @@ _FEW = 0.02
 _SLACK = 0.05
 
 
-def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden:
-    """What is to be hidden while the footage is tracked again, by index of the frame.
+class Hidden:
+    """What is hidden of each picture: of one between two keyframes, what is of either.
+
+    Args:
+        indices: of the frames of keyframes, ascending.
+        masks: [H,W] of each.
+    """
+
+    def __init__(self, indices: Sequence[int], masks: Sequence[_Mask]) -> None:
+        self._indices = list(indices)
+        self._masks = list(masks)
+
+    @property
+    def share(self) -> float:
+        """Mean share of the pictures of keyframes that is hidden."""
+        return float(np.mean([mask.mean() for mask in self._masks])) if self._masks else 0.0
+
+    def __call__(self, index: int) -> _Mask | None:
+        """The mask [H,W] of the frame with this index; None where nothing is hidden of it."""
+        # The same for a keyframe; the last keyframe for what comes after it.
+        last = len(self._indices) - 1
+        before = max(bisect_right(self._indices, index) - 1, 0)
+        after = min(bisect_left(self._indices, index), last)
+        mask = self._masks[before]
+        if after != before:
+            mask = mask | self._masks[after]
+        return mask if mask.any() else None
+
+
+def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden | None:
+    """What is to be hidden while the footage is tracked again.
 
     Args:
         system, outcome: of the first time.
         below: agreement below which it is doubtful; 1 doubts all.
     Returns:
-        [H,W] of keyframes, where uncertainty leaves less than half; nothing where there is no
-        doubt, or hardly anything to hide. The user's masks are not in it: they hold anyway.
+        Where uncertainty leaves less than half; None where there is no doubt, or hardly anything
+        to hide. The user's masks are not in it: they hold anyway.
     """
     agreement = outcome.diagnosis.agreement
     # NaN, where nothing was adjusted, is no reason.
     if not (agreement < below or (below == 1.0 and agreement == 1.0)):
-        return {}
+        return None
     store, grid = system.store, system.grid
     size = (system.camera.width, system.camera.height)
     gates = system.optimiser.learned_gates(range(len(store))).float().cpu().numpy()
-    found = {}
-    for info, gate in zip(store.infos, gates, strict=True):
-        mask = closed(gate, grid.stride, grid.offset, size, _CLOSED)
-        if mask.any():
-            found[info.index] = mask
-    covered = sum(float(mask.mean()) for mask in found.values())
-    return found if covered >= _FEW * len(store) else {}
+    hidden = Hidden(
+        [info.index for info in store.infos],
+        [closed(gate, grid.stride, grid.offset, size, _CLOSED) for gate in gates],
+    )
+    return hidden if hidden.share >= _FEW else None
 
 
 def accepted(first: Outcome, second: Outcome) -> bool:

@@ -150,7 +150,7 @@ class _Run:
         threads = "threads" in able or (self.device.type == "cuda" and "gpu-threads" in able)
         clock = Stopwatch()
 
-        def build(hidden: Hidden) -> SlamSystem:
+        def build(hidden: Hidden | None) -> SlamSystem:
             return SlamSystem(
                 self.config,
                 self._build(),
@@ -163,7 +163,7 @@ class _Run:
                 clock=clock,
             )
 
-        system = build({})
+        system = build(None)
         self.built = time.perf_counter()
 
         passes = chain([chain([first], pictures)], iter(source.frames, None))
@@ -225,12 +225,12 @@ class _Run:
         self,
         first: SlamSystem,
         outcome: Outcome,
-        build: Callable[[Hidden], SlamSystem],
+        build: Callable[[Hidden | None], SlamSystem],
         frames: Callable[[], Generator[Frame, None, None]],
     ) -> tuple[SlamSystem, Outcome]:
         """Track once more where the outcome is doubtful; what was found stays if that fails."""
         hidden = to_hide(first, outcome, self.config.frontend.again_below)
-        if not hidden:
+        if hidden is None:
             return first, outcome
         _log.info(
             "%.0f %% of what was measured agrees with poses and depths: tracking once more, "

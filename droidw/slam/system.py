@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -65,8 +65,8 @@ class SlamSystem:
         events: who hears what happens.
         threaded: whether correspondence may be called from another thread, ahead of time.
         focal_known: the focal length of `camera` is a calibration, not a guess.
-        hidden: by index of a frame, [H,W] True where its picture is ignored while tracking; global
-            adjustment sees it again.
+        hidden: index of a frame -> [H,W] True where its picture is ignored while tracking, or None;
+            global adjustment and the filler see all of it.
         clock: where the time of each stage is added up.
     Attributes:
         camera: the working camera, after `finish` with the focal length that was found.
@@ -83,7 +83,7 @@ class SlamSystem:
         *,
         threaded: bool = False,
         focal_known: bool = True,
-        hidden: Mapping[int, npt.NDArray[np.bool_]] | None = None,
+        hidden: Callable[[int], npt.NDArray[np.bool_] | None] | None = None,
         clock: Stopwatch | None = None,
     ) -> None:
         self.config = config
@@ -124,7 +124,7 @@ class SlamSystem:
         self._moved: list[float] = []
         self._matched: list[float] = []
         self._kept: dict[int, object] = {}
-        self._hidden = hidden or {}
+        self._hidden = hidden or (lambda index: None)
         # What global adjustment sees of keyframes of which something is hidden, by index.
         self._plain: dict[int, tuple[object, Tensor]] = {}
         self._room = config.filler.cache_mb * 1e6
@@ -166,7 +166,7 @@ class SlamSystem:
 
     def _hide(self, plain: Encoded) -> Encoded:
         """The frame without what is hidden of it, and beside that as it is."""
-        hidden, frame = self._hidden.get(plain.frame.index), plain.frame
+        hidden, frame = self._hidden(plain.frame.index), plain.frame
         if hidden is None:
             return plain
         mask = torch.from_numpy(hidden)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from droidw.geometry.camera import Grid
-from droidw.run.again import accepted, to_hide
+from droidw.run.again import Hidden, accepted, to_hide
 from droidw.slam.diagnosis import Diagnosis
 from droidw.slam.system import SlamSystem
 
@@ -47,26 +47,41 @@ def first():
 
 def test_what_uncertainty_closes_is_hidden(first):
     hidden = to_hide(first, outcome(0.5), below=0.7)
-    assert sorted(hidden) == [4, 7]
-    assert hidden[4].shape == (96, 128)
-    assert hidden[4][:, :56].all()
-    assert not hidden[4][:, 72:].any()
+    for index in (4, 7):
+        assert hidden(index).shape == (96, 128)
+        assert hidden(index)[:, :56].all()
+        assert not hidden(index)[:, 72:].any()
+    assert hidden(9) is None
+
+
+def test_between_keyframes_what_either_hides_is_hidden():
+    left, right, nothing = (np.zeros((6, 8), bool) for _ in range(3))
+    left[:, :3], right[:, 5:] = True, True
+    hidden = Hidden([2, 6, 9], [left, right, nothing])
+    assert (hidden(2) == left).all()
+    assert (hidden(4) == (left | right)).all()
+    assert (hidden(6) == right).all()
+    assert (hidden(8) == right).all()
+    assert hidden(9) is None
+    assert hidden(12) is None
+    assert (hidden(0) == left).all()
+    assert hidden.share == pytest.approx((3 / 8 + 3 / 8) / 3)
 
 
 @pytest.mark.parametrize("agreement", [0.7, 0.9, float("nan")])
 def test_without_doubt_nothing_is_hidden(first, agreement):
-    assert to_hide(first, outcome(agreement), below=0.7) == {}
+    assert to_hide(first, outcome(agreement), below=0.7) is None
 
 
 def test_one_doubts_all_and_zero_nothing(first):
     assert to_hide(first, outcome(1.0), below=1.0)
-    assert to_hide(first, outcome(0.0), below=0.0) == {}
+    assert to_hide(first, outcome(0.0), below=0.0) is None
 
 
 def test_a_little_is_not_worth_the_time(first):
     first.gates[:] = 1.0
     first.gates[0, :2, :2] = 0.0
-    assert to_hide(first, outcome(0.5), below=0.7) == {}
+    assert to_hide(first, outcome(0.5), below=0.7) is None
 
 
 def test_the_second_outcome_stays_unless_it_agrees_much_less():
