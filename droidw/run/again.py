@@ -18,7 +18,8 @@ from droidw.geometry.spread import closed
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from droidw.slam.system import Outcome, SlamSystem
+    from droidw.slam.records import Outcome
+    from droidw.slam.system import SlamSystem
 
 __all__ = ["Hidden", "accepted", "to_hide"]
 

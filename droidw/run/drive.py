@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -31,7 +32,8 @@ from droidw.run.signals import Stop
 from droidw.run.sources import open_source
 from droidw.slam.frame import RunResult
 from droidw.slam.optimise import Parts
-from droidw.slam.system import Outcome, SlamSystem
+from droidw.slam.records import Outcome
+from droidw.slam.system import SlamSystem
 from droidw.slam.timing import Stopwatch
 
 if TYPE_CHECKING:
@@ -98,6 +100,7 @@ class _Run:
         self.config, self.device, self.stop, self.note = resolved.config, device, stop, note
         self.started = time.perf_counter()
         self.sweeps = 1
+        self.clock = Stopwatch()
         self.context = BuildContext(
             device=device,
             seed=self.config.seed,
@@ -148,7 +151,6 @@ class _Run:
         self.context = replace(self.context, camera=camera)
         able = self.resolved.parts["correspondence"][0].capabilities
         threads = "threads" in able or (self.device.type == "cuda" and "gpu-threads" in able)
-        clock = Stopwatch()
 
         def build(hidden: Hidden | None) -> SlamSystem:
             return SlamSystem(
@@ -160,16 +162,19 @@ class _Run:
                 threaded=threads,
                 focal_known=not guessed,
                 hidden=hidden,
-                clock=clock,
+                clock=self.clock,
             )
 
         system = build(None)
+        self.setup = facts_of_setup(
+            self.resolved, self.device, self.context.weights_dir, system.parts
+        )
         self.built = time.perf_counter()
 
         passes = chain([chain([first], pictures)], iter(source.frames, None))
 
         def frames() -> Generator[Frame, None, None]:
-            return prefetch(self._prepared(next(passes), rectify, clock), ahead=8)
+            return prefetch(self._prepared(next(passes), rectify), ahead=8)
 
         self.events.emit(
             RunStarted(self.config.input.source, self.run_dir, source.length, self._facts())
@@ -180,24 +185,28 @@ class _Run:
         if not system.frames:
             raise Interrupted("stopped by a signal before the first frame", self.stop.signum)
         outcome = system.finish(frames, brief=failure is not None or self.stop.signum > 0)
+        hidden = None
         if failure is None and not self.stop.signum:
-            system, outcome = self._again(system, outcome, build, frames)
-        if system.focal is not None and system.focal.factor != 1.0:
+            hidden = to_hide(system, outcome, self.config.frontend.again_below)
+        # What it measured is not needed any more, and the second time needs the room.
+        del system
+        if hidden is not None:
+            gc.collect()
+            outcome = self._again(outcome, hidden, build, frames)
+        if outcome.focal is not None and outcome.focal.factor != 1.0:
             self.said += (
-                f"; focal length refined to {system.focal.factor:.3f} times that, "
-                f"{camera.fx * system.focal.factor:.1f} px of the raw picture"
+                f"; focal length refined to {outcome.focal.factor:.3f} times that, "
+                f"{camera.fx * outcome.focal.factor:.1f} px of the raw picture"
             )
-        result = self._export(system, source, outcome)
+        result = self._export(source, outcome)
         self._conclude(failure, result, outcome)
         return result
 
-    def _prepared(
-        self, pictures: Iterable[RawFrame], rectify: Rectifier, clock: Stopwatch
-    ) -> Iterator[Frame]:
+    def _prepared(self, pictures: Iterable[RawFrame], rectify: Rectifier) -> Iterator[Frame]:
         """Frames at working size; what decoding takes is counted in the thread that decodes."""
         pending = iter(pictures)
         while True:
-            with clock("decode"):
+            with self.clock("decode"):
                 raw = next(pending, None)
                 mask = None if raw is None or self.masks is None else self.masks.of(raw)
                 frame = None if raw is None else rectify(raw, mask)
@@ -223,15 +232,12 @@ class _Run:
 
     def _again(
         self,
-        first: SlamSystem,
         outcome: Outcome,
+        hidden: Hidden,
         build: Callable[[Hidden | None], SlamSystem],
         frames: Callable[[], Generator[Frame, None, None]],
-    ) -> tuple[SlamSystem, Outcome]:
-        """Track once more where the outcome is doubtful; what was found stays if that fails."""
-        hidden = to_hide(first, outcome, self.config.frontend.again_below)
-        if hidden is None:
-            return first, outcome
+    ) -> Outcome:
+        """Track once more, as the outcome is doubtful; what was found stays if that fails."""
         _log.info(
             "%.0f %% of what was measured agrees with poses and depths: tracking once more, "
             "without what was found to move (frontend.again_below=0 does not)",
@@ -240,16 +246,16 @@ class _Run:
         second = build(hidden)
         if self._track(second, frames) is not None or self.stop.signum:
             self.events.warn("what was found the first time is kept")
-            return first, outcome
+            return outcome
         try:
             found = second.finish(frames)
         except Exception as error:  # noqa: BLE001 - the first outcome is as good as it was
             self.events.warn(f"tracking once more failed: {error}")
-            return first, outcome
+            return outcome
         if not accepted(outcome, found):
-            return first, outcome
+            return outcome
         self.sweeps = 2
-        return second, found
+        return found
 
     def _conclude(self, failure: Exception | None, result: RunResult, outcome: Outcome) -> None:
         written = f"{len(result.trajectory)} poses were written to {self.run_dir}/trajectory.tum"
@@ -291,11 +297,11 @@ class _Run:
             "parts": {slot: part.name for slot, (part, _) in self.resolved.parts.items()},
         }
 
-    def _export(self, system: SlamSystem, source: FrameSource, outcome: Outcome) -> RunResult:
+    def _export(self, source: FrameSource, outcome: Outcome) -> RunResult:
         warnings = self.events
         for text in (*outcome.diagnosis.warnings(), *(self.masks.problems() if self.masks else ())):
             warnings.warn(text)
-        for status, count in system.optimiser.reports.items():
+        for status, count in outcome.reports.items():
             warnings.warn(REPORTS.get(status, "{count} steps: " + status).format(count=count))
         if source.skipped:
             shown = "; ".join(source.problems[:3])
@@ -311,16 +317,16 @@ class _Run:
             trajectory=outcome.trajectory,
             keyframes=outcome.keyframes,
             cloud=outcome.cloud,
-            camera=system.camera,
-            stride=system.grid.stride,
-            offset=system.grid.offset,
+            camera=outcome.camera,
+            stride=outcome.grid.stride,
+            offset=outcome.grid.offset,
             source=self.config.input.source,
             truth=truth,
-            manifest=self._manifest(system, source, outcome),
+            manifest=self._manifest(source, outcome),
             run_dir=self.run_dir,
         )
         total = len(self.resolved.exporters)
-        with system.clock("export"):
+        with self.clock("export"):
             for done, (component, options) in enumerate(self.resolved.exporters):
                 try:
                     component.factory(options, self.context).export(result, self.run_dir)
@@ -333,7 +339,7 @@ class _Run:
         if metrics is not None:
             write_json(self.run_dir / "metrics.json", metrics)
         # Exporters take time and write files; all else holds.
-        manifest = {**result.manifest, **self._facts_of_time(system, outcome), **self._files()}
+        manifest = {**result.manifest, **self._facts_of_time(outcome), **self._files()}
         result = replace(result, manifest=manifest, warnings=tuple(warnings.warnings))
         write_json(self.run_dir / "manifest.json", {**manifest, "warnings": warnings.warnings})
         self.events.emit(RunFinished(result, self.run_dir, metrics))
@@ -359,23 +365,21 @@ class _Run:
             self.events.warn(f"the uncertainty was not scored: {error.message}")
             return metrics
 
-    def _manifest(
-        self, system: SlamSystem, source: FrameSource, outcome: Outcome
-    ) -> dict[str, Any]:
+    def _manifest(self, source: FrameSource, outcome: Outcome) -> dict[str, Any]:
         return {
             "source": self.config.input.source,
-            **facts_of_tracking(system, source, outcome),
+            **facts_of_tracking(source, outcome),
             "sweeps": self.sweeps,
-            **self._facts_of_time(system, outcome),
+            **self._facts_of_time(outcome),
             "camera": self.said,
-            **facts_of_setup(self.resolved, self.device, self.context.weights_dir, system.parts),
+            **self.setup,
             "note": self.note,
             **self._files(),
         }
 
-    def _facts_of_time(self, system: SlamSystem, outcome: Outcome) -> dict[str, Any]:
+    def _facts_of_time(self, outcome: Outcome) -> dict[str, Any]:
         return facts_of_time(
-            system,
+            self.clock,
             len(outcome.trajectory),
             self.built - self.started,
             time.perf_counter() - self.started,

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
     from droidw.config.resolve import ResolvedConfig
     from droidw.interfaces.datasets import FrameSource
-    from droidw.slam.system import Outcome, SlamSystem
+    from droidw.slam.records import Outcome
+    from droidw.slam.timing import Stopwatch
 
 __all__ = [
     "REPORTS",
@@ -113,12 +114,12 @@ REPORTS = {
 """What the optimiser counts -> the sentence for the user."""
 
 
-def facts_of_tracking(system: SlamSystem, source: FrameSource, outcome: Outcome) -> dict[str, Any]:
+def facts_of_tracking(source: FrameSource, outcome: Outcome) -> dict[str, Any]:
     """How much was read and tracked, and with which working camera."""
-    camera, agreement = system.camera, outcome.diagnosis.agreement
+    camera, agreement = outcome.camera, outcome.diagnosis.agreement
     return {
         "frames": len(outcome.trajectory),
-        "last_frame": system.last_index,
+        "last_frame": outcome.last_index,
         "keyframes": len(outcome.keyframes),
         "agreement": None if math.isnan(agreement) else round(agreement, 4),
         "skipped": source.skipped,
@@ -131,15 +132,13 @@ def facts_of_tracking(system: SlamSystem, source: FrameSource, outcome: Outcome)
             "cx": camera.cx,
             "cy": camera.cy,
         },
-        "scale": "metric, from the depth prior" if system.parts.depth.metric else "arbitrary",
+        "scale": "metric, from the depth prior" if outcome.metric else "arbitrary",
     }
 
 
-def facts_of_time(
-    system: SlamSystem, frames: int, starting: float, elapsed: float
-) -> dict[str, Any]:
+def facts_of_time(clock: Stopwatch, frames: int, starting: float, elapsed: float) -> dict[str, Any]:
     """Seconds in all and by stage, frames per second without the start, peak memory."""
-    stages = {**system.clock.seconds, "start": starting}
+    stages = {**clock.seconds, "start": starting}
     return {
         "seconds": round(elapsed, 3),
         "fps": round(frames / max(elapsed - starting, 1e-9), 2),

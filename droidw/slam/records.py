@@ -1,7 +1,9 @@
-"""Keyframes as they leave a run."""
+"""What leaves a run."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from droidw.geometry.se3 import inv
@@ -10,9 +12,41 @@ from droidw.slam.frame import KeyframeRecord
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from droidw.geometry.camera import Camera, Grid
     from droidw.graph.store import KeyframeStore
+    from droidw.slam.diagnosis import Diagnosis
+    from droidw.slam.focal import FocalSearch
+    from droidw.slam.frame import CloudPoints, Trajectory
 
-__all__ = ["keyframe_records"]
+__all__ = ["Outcome", "keyframe_records"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What tracking came to; all that is left of a `SlamSystem`.
+
+    Attributes:
+        trajectory: poses of all frames.
+        keyframes, cloud: records on the CPU.
+        diagnosis: what to say of it.
+        camera: the working camera, with the focal length that was found.
+        grid: where the cells of a keyframe's maps lie.
+        focal: what the search for the focal length came to, None where there was none.
+        last_index: index in the source of the frame tracked last.
+        metric: depth came from a prior in metres.
+        reports: status of steps that were left out -> how many.
+    """
+
+    trajectory: Trajectory
+    keyframes: tuple[KeyframeRecord, ...]
+    cloud: CloudPoints
+    diagnosis: Diagnosis
+    camera: Camera
+    grid: Grid
+    focal: FocalSearch | None
+    last_index: int
+    metric: bool
+    reports: Mapping[str, int]
 
 
 def keyframe_records(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,14 +20,14 @@ from droidw.geometry.transfer import upload
 from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.slam.backend import Backend
 from droidw.slam.cloud import consistent_depth, static_cloud
-from droidw.slam.diagnosis import Diagnosis, diagnose, parallax
+from droidw.slam.diagnosis import diagnose, parallax
 from droidw.slam.filler import Filler
 from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
 from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict, look_ahead
 from droidw.slam.optimise import Optimiser, Parts
-from droidw.slam.records import keyframe_records
+from droidw.slam.records import Outcome, keyframe_records
 from droidw.slam.streams import Ahead, nbytes
 from droidw.slam.timing import Stopwatch
 from droidw.solve.weights import unmasked
@@ -36,20 +36,10 @@ if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig
     from droidw.geometry.camera import Camera
 
-__all__ = ["Outcome", "SlamSystem"]
+__all__ = ["SlamSystem"]
 
 # Frames that are encoded and judged ahead of the one being tracked.
 _LOOK_AHEAD = 32
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What tracking came to: poses of all frames, the keyframes, the cloud and what to say."""
-
-    trajectory: Trajectory
-    keyframes: tuple[KeyframeRecord, ...]
-    cloud: CloudPoints
-    diagnosis: Diagnosis
 
 
 class SlamSystem:
@@ -312,7 +302,18 @@ class SlamSystem:
         if not found.still:
             share = parallax(self.store, self.optimiser.gates())
             found = replace(found, parallax=share, points=len(cloud.xyz))
-        return Outcome(trajectory, records, cloud, found)
+        return Outcome(
+            trajectory=trajectory,
+            keyframes=records,
+            cloud=cloud,
+            diagnosis=found,
+            camera=self.camera,
+            grid=self.grid,
+            focal=self.focal,
+            last_index=self.last_index,
+            metric=self.parts.depth.metric,
+            reports=dict(self.optimiser.reports),
+        )
 
     def _reveal(self) -> None:
         """From now on nothing is hidden: matches are made with whole pictures."""

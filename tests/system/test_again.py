@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -187,6 +188,26 @@ def test_what_was_found_first_stays_if_the_second_time_fails(
     assert (ran.folder / "trajectory.tum").read_bytes() == (
         plain.folder / "trajectory.tum"
     ).read_bytes()
+
+
+def test_the_first_is_gone_while_the_second_tracks(go, footage, monkeypatch):
+    track, finish, built, alive = SlamSystem.track, SlamSystem.finish, [], []
+
+    def spy(self, frames):
+        alive.append([one() is not None for one in built])
+        built.append(weakref.ref(self))
+        track(self, frames)
+
+    def finished(self, reread, *, brief=False):
+        found = finish(self, reread, brief=brief)
+        closing(self)
+        return found
+
+    monkeypatch.setattr(SlamSystem, "track", spy)
+    monkeypatch.setattr(SlamSystem, "finish", finished)
+    ran = go(footage().folder, *AGAIN)
+    assert ran.code == 0, ran.err
+    assert alive == [[], [False]]
 
 
 def test_an_outcome_that_agrees_much_less_is_left(go, footage, monkeypatch):
