@@ -160,7 +160,8 @@ class FrontendConfig:
     again_below: float = opt(
         0.72,
         "agreement of all matches with poses and depths in the end below which the footage is "
-        "tracked once more, without what the first time was found to move (0: never, 1: always)",
+        "tracked once more, without what the first time was found to move, if that is 2 % of the "
+        "pictures or more (0: never, 1: however much agrees)",
         ge=0,
         le=1,
     )

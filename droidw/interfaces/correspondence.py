@@ -115,6 +115,10 @@ class Correspondence(Protocol):
     def encode(self, frame: Frame, grid: Grid) -> Any:
         """What is needed of every frame; opaque to the core, cheap to hold.
 
+        Where footage is tracked once more, frames are encoded twice: as they are, and with a mask
+        over what was found to move. `context` is asked of both, in this order. What is held by
+        the index of a frame has to tell them apart.
+
         Raises:
             InputError: pictures of this size cannot be taken; says which can.
         """

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from droidw.slam.records import Outcome
     from droidw.slam.system import SlamSystem
 
-__all__ = ["Hidden", "accepted", "to_hide"]
+__all__ = ["Hidden", "rejection", "to_hide"]
 
 _Mask = npt.NDArray[np.bool_]
 
@@ -85,6 +85,12 @@ def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden | None
     return hidden if hidden.share >= _FEW else None
 
 
-def accepted(first: Outcome, second: Outcome) -> bool:
-    """Whether what was found the second time is to be kept; it is, unless it agrees much less."""
-    return second.diagnosis.agreement >= first.diagnosis.agreement - _SLACK
+def rejection(first: Outcome, second: Outcome) -> str:
+    """Why what was found the second time is not to be kept; "" if it is."""
+    frames, before = len(second.trajectory), len(first.trajectory)
+    if frames < before:
+        return f"only {frames} of {before} frames could be read again"
+    agreement = second.diagnosis.agreement
+    if not agreement >= first.diagnosis.agreement - _SLACK:
+        return f"{100 * agreement:.0f} % of what was measured agrees the second time"
+    return ""

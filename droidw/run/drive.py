@@ -23,9 +23,9 @@ from droidw.io.prefetch import prefetch
 from droidw.io.tum import write_tum
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
-from droidw.run.again import Hidden, accepted, to_hide
+from droidw.run.again import Hidden, rejection, to_hide
 from droidw.run.cameras import choose_camera, open_masks
-from droidw.run.folder import FILES, prepare, withdraw, write_json, write_text
+from droidw.run.folder import listed, prepare, withdraw, write_json, write_text
 from droidw.run.machine import run_device, settle
 from droidw.run.manifest import REPORTS, facts_of_setup, facts_of_time, facts_of_tracking
 from droidw.run.signals import Stop
@@ -99,7 +99,7 @@ class _Run:
         self.resolved, self.plugins, self.run_dir = resolved, plugins, run_dir
         self.config, self.device, self.stop, self.note = resolved.config, device, stop, note
         self.started = time.perf_counter()
-        self.sweeps = 1
+        self.sweeps = self.kept = 1
         self.clock = Stopwatch()
         self.context = BuildContext(
             device=device,
@@ -243,18 +243,18 @@ class _Run:
             "without what was found to move (frontend.again_below=0 does not)",
             100 * outcome.diagnosis.agreement,
         )
-        second = build(hidden)
-        if self._track(second, frames) is not None or self.stop.signum:
-            self.events.warn("what was found the first time is kept")
-            return outcome
-        try:
-            found = second.finish(frames)
-        except Exception as error:  # noqa: BLE001 - the first outcome is as good as it was
-            self.events.warn(f"tracking once more failed: {error}")
-            return outcome
-        if not accepted(outcome, found):
-            return outcome
         self.sweeps = 2
+        try:
+            second = build(hidden)
+            stopped = self._track(second, frames) is not None or self.stop.signum > 0
+            found = None if stopped else second.finish(frames)
+            why = "it did not come to an end" if found is None else rejection(outcome, found)
+        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the first is as good as it was
+            found, why = None, str(error) or type(error).__name__
+        if found is None or why:
+            self.events.warn(f"tracked once more, but what was found first is kept: {why}")
+            return outcome
+        self.kept = 2
         return found
 
     def _conclude(self, failure: Exception | None, result: RunResult, outcome: Outcome) -> None:
@@ -370,6 +370,7 @@ class _Run:
             "source": self.config.input.source,
             **facts_of_tracking(source, outcome),
             "sweeps": self.sweeps,
+            "kept_sweep": self.kept,
             **self._facts_of_time(outcome),
             "camera": self.said,
             **self.setup,
@@ -391,10 +392,4 @@ class _Run:
         later = {"manifest.json"}
         if any(part.name == "report" for part, _ in self.resolved.observers):
             later.add("report.html")
-        return {
-            "files": {
-                name: meaning
-                for name, meaning in FILES.items()
-                if (self.run_dir / name).exists() or name in later
-            },
-        }
+        return {"files": listed(self.run_dir, later)}

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 from droidw.errors import UsageError
 from droidw.io.files import atomic_write
 
-__all__ = ["FILES", "prepare", "withdraw", "write_json", "write_text"]
+__all__ = ["FILES", "listed", "prepare", "withdraw", "write_json", "write_text"]
 
 FILES: Mapping[str, str] = {
     "trajectory.tum": "pose of every input frame: t tx ty tz qx qy qz qw, camera to world",
@@ -89,6 +89,15 @@ def withdraw(run_dir: Path, fresh: bool) -> None:
             (run_dir / name).unlink()
         if fresh:
             run_dir.rmdir()
+
+
+def listed(run_dir: Path, later: Collection[str]) -> dict[str, str]:
+    """What lies in the folder, or will `later`, and what it means."""
+    return {
+        name: meaning
+        for name, meaning in FILES.items()
+        if (run_dir / name).exists() or name in later
+    }
 
 
 def _clear(path: Path) -> None:

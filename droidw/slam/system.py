@@ -214,6 +214,7 @@ class SlamSystem:
             infos = list(self.store.infos)
             dropped = self.frontend.grow(forced)
         if dropped is not None:
+            self._plain.pop(infos[dropped].index, None)
             self.events.emit(KeyframeRemoved(dropped, infos[dropped].index))
         self._filter.settled(current.frame.index, dropped != number)
         return dropped != number

@@ -70,7 +70,7 @@ def median_length(
     place = torch.where(use, place, 0.0).long().clamp_(0, bins - 1)
     if group is not None:
         place += bins * group[:, None, None]
-    # A fixed order of adding up, so that one seed gives the same bytes; float32 would lose count.
+    # One order of adding up on a CPU, so that one seed gives the same bytes; float32 loses count.
     total = torch.zeros(groups * bins, dtype=torch.float64, device=weight.device)
     total.index_add_(0, place.flatten(), torch.where(use, mean, 0.0).flatten().double())
     below = total.view(groups, bins).cumsum(-1)

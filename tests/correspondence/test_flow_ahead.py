@@ -1,4 +1,4 @@
-"""The motion filter runs ahead in a thread; what edges find may not depend on how far."""
+"""What the motion filter finds, ahead in a thread, is kept for edges of the same pictures."""
 
 from __future__ import annotations
 
@@ -35,3 +35,26 @@ def test_an_edge_does_not_depend_on_how_far_ahead_the_filter_is(operator, frame,
     assert torch.equal(target(3), target(80))
     # the filter's search starts from the motion so far: this would be seen
     assert not torch.equal(target(3), target(0))
+
+
+def test_what_it_finds_under_a_mask_is_not_taken_for_the_whole_picture(operator, frame):
+    """A frame is encoded twice where it is tracked without what was found to move."""
+    mask = np.zeros((H, W), bool)
+    mask[:, 40:120] = True
+    part = operator()
+    grid = Grid.of(H, W, part.stride, part.offset)
+
+    def encoded(*masks):
+        frames = [frame(k, moving(k), masks[k]) for k in range(2)]
+        return [part.encode(f, grid) for f in frames], frames[1]
+
+    (plain, last), (hidden, _) = encoded(None, None), encoded(mask, mask)
+    fresh = operator().one_way(*plain)
+    part.motion(*hidden)
+    part.context(hidden[1], last, grid)
+    assert np.array_equal(part.one_way(*plain).target, fresh.target)
+    whole = part.both_ways(*plain, None, None, bridged=tuple(plain))
+    cut = part.both_ways(*hidden, None, None, bridged=tuple(hidden))
+    assert not np.array_equal(whole[0].target, cut[0].target)
+    again = operator().both_ways(*plain, None, None, bridged=tuple(plain))
+    assert np.array_equal(whole[0].target, again[0].target)

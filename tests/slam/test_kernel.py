@@ -69,31 +69,52 @@ def test_matches_that_are_wrong_alike_pull_a_huber_kernel_and_not_a_cauchy_kerne
     assert torch.isfinite(store.disps).all()
 
 
-def test_a_frame_is_located_in_spite_of_them(spoilt):
+@pytest.fixture
+def located(spoilt):
+    """`located(targets, solver)`: frames near the last keyframe, each by [h,w,2] in it.
+
+    Each is measured from the keyframe three before that, `row` of the graph.
+    """
     optimiser, graph, T_cw = spoilt
     last = COUNT - 1
     row = graph.pairs.index((last - 3, last))
-    answer = EdgeUpdate(graph.target[row : row + 1], graph.confidence[row : row + 1])
-    session = SimpleNamespace(update=lambda request: answer)
-    optimiser.parts = Parts(
-        None, None, None, TorchBundleAdjuster(), SimpleNamespace(session=lambda purpose: session)
-    )
     optimiser.store.write(T_cw, optimiser.store.disps)
-    left = []
-    for cauchy in (0.0, 0.2):
-        found = locate(
+
+    def call(targets, solver):
+        count = len(targets)
+        answer = EdgeUpdate(torch.stack(targets), graph.confidence[[row] * count])
+        session = SimpleNamespace(update=lambda request: answer)
+        operator = SimpleNamespace(session=lambda purpose: session)
+        optimiser.parts = Parts(None, None, None, TorchBundleAdjuster(), operator)
+        return locate(
             optimiser,
-            [None],
-            mul(exp(torch.full((1, 6), 0.01)), T_cw[last:]),
-            [[last - 3]],
+            [None] * count,
+            mul(exp(torch.full((count, 6), 0.01)), T_cw[[last] * count]),
+            [[last - 3]] * count,
             torch.ones(COUNT, H, W),
             updates=1,
             iterations=20,
-            solver=robust(cauchy),
+            solver=solver,
             label="test",
         )
-        left.append(apart(found, T_cw[last:]))
+
+    call.target = graph.target[row]
+    return call
+
+
+def test_a_frame_is_located_in_spite_of_them(spoilt, located):
+    _, _, T_cw = spoilt
+    left = [apart(located([located.target], robust(c)), T_cw[-1:]) for c in (0.0, 0.2)]
     assert left[1] < 0.2 * left[0]
+
+
+def test_a_frame_does_not_share_the_width_of_its_kernel_with_others(located):
+    noise = torch.randn(H, W, 2, generator=torch.Generator().manual_seed(3))
+    exact, rough = located.target + 0.01 * noise, located.target + 0.5 * noise
+    solver = SolverConfig(lm=1e-6, ep=1e-6, cauchy=0.75, cauchy_tuning=0.5)
+    together = located([exact, rough], solver)
+    alone = torch.cat([located([one], solver) for one in (exact, rough)])
+    assert torch.allclose(together, alone, atol=1e-5)
 
 
 @pytest.fixture

@@ -12,16 +12,20 @@ import pytest
 import torch
 
 from droidw.geometry.camera import Grid
-from droidw.run.again import Hidden, accepted, to_hide
+from droidw.run.again import Hidden, rejection, to_hide
+from droidw.run.drive import _Run
+from droidw.slam.backend import Backend
 from droidw.slam.diagnosis import Diagnosis
+from droidw.slam.filler import Filler
 from droidw.slam.system import SlamSystem
 
 LEARNED = ("features=cnn", "uncertainty=affine-softplus", "threads=1")
 AGAIN = (*LEARNED, "frontend.again_below=1")
 
 
-def outcome(agreement):
-    return SimpleNamespace(diagnosis=Diagnosis(30, 3, still=False, lost=0.0, agreement=agreement))
+def outcome(agreement, frames=30):
+    diagnosis = Diagnosis(frames, 3, still=False, lost=0.0, agreement=agreement)
+    return SimpleNamespace(diagnosis=diagnosis, trajectory=range(frames))
 
 
 class Store(list):
@@ -85,11 +89,12 @@ def test_a_little_is_not_worth_the_time(first):
     assert to_hide(first, outcome(0.5), below=0.7) is None
 
 
-def test_the_second_outcome_stays_unless_it_agrees_much_less():
-    assert accepted(outcome(0.60), outcome(0.70))
-    assert accepted(outcome(0.60), outcome(0.58))
-    assert not accepted(outcome(0.60), outcome(0.50))
-    assert not accepted(outcome(0.60), outcome(float("nan")))
+def test_the_second_outcome_stays_unless_it_agrees_much_less_or_is_shorter():
+    assert rejection(outcome(0.60), outcome(0.70)) == ""
+    assert rejection(outcome(0.60), outcome(0.58)) == ""
+    assert "50 %" in rejection(outcome(0.60), outcome(0.50))
+    assert rejection(outcome(0.60), outcome(float("nan")))
+    assert "18 of 26 frames" in rejection(outcome(0.60, 26), outcome(0.70, 18))
 
 
 def closing(system, share=0.4):
@@ -106,33 +111,63 @@ def closing(system, share=0.4):
 
 @pytest.fixture
 def watched(monkeypatch):
-    """Every system that a run builds: what it is given to hide, and its keyframes."""
+    """Every system that a run finishes, and what is covered of its pictures in each stage."""
     made = []
-    finish = SlamSystem.finish
+    finish, adjust, fill = SlamSystem.finish, Backend.run, Filler.fill
 
-    def spy(self, reread, *, brief=False):
-        covered = [info.payload.covered for info in self.store.infos]
+    def covered(payloads):
+        return [payload.covered for payload in payloads]
+
+    def finished(self, reread, *, brief=False):
+        seen = covered(info.payload for info in self.store.infos)
+        made.append(SimpleNamespace(system=self, tracked=seen, filled=[]))
         found = finish(self, reread, brief=brief)
-        revealed = [info.payload.covered for info in self.store.infos]
-        made.append(SimpleNamespace(system=self, covered=covered, revealed=revealed))
         closing(self)
         return found
 
-    monkeypatch.setattr(SlamSystem, "finish", spy)
+    def adjusted(self, tell):
+        made[-1].adjusted = covered(info.payload for info in made[-1].system.store.infos)
+        made[-1].unmasked = made[-1].system.store["unmasked"].clone()
+        adjust(self, tell)
+
+    def filled(self, batch):
+        made[-1].filled += covered(encoded.payload for encoded in batch)
+        return fill(self, batch)
+
+    monkeypatch.setattr(SlamSystem, "finish", finished)
+    monkeypatch.setattr(Backend, "run", adjusted)
+    monkeypatch.setattr(Filler, "fill", filled)
     return made
 
 
-def test_pictures_are_whole_again_in_global_adjustment(go, footage, watched):
-    ran = go(footage().folder, *AGAIN)
+@pytest.mark.parametrize("cache", [512, 0])
+def test_pictures_are_whole_again_once_all_is_tracked(go, footage, watched, cache):
+    ran = go(footage().folder, *AGAIN, f"filler.cache_mb={cache}")
     assert ran.code == 0, ran.err
-    assert ran.manifest["sweeps"] == 2
+    assert ran.manifest["sweeps"] == ran.manifest["kept_sweep"] == 2
     assert 0 < ran.manifest["agreement"] <= 1
     one, two = watched
-    assert all(mask is None for mask in one.covered)
-    assert any(mask is not None for mask in two.covered)
-    assert all(mask is None for mask in two.revealed)
-    assert torch.equal(two.system.store["unmasked"], torch.ones_like(two.system.store["unmasked"]))
+    assert all(mask is None for mask in one.tracked)
+    assert any(mask is not None for mask in two.tracked)
+    assert two.filled
+    assert all(mask is None for mask in two.adjusted + two.filled)
+    assert torch.equal(two.unmasked, torch.ones_like(two.unmasked))
     assert len(ran.poses) == 26
+
+
+def test_nothing_is_kept_of_keyframes_that_are_dropped(go, footage, monkeypatch):
+    reveal, kept = SlamSystem._reveal, []
+
+    def spy(self):
+        kept.append((set(self._plain), {info.index for info in self.store.infos}))
+        closing(self)
+        reveal(self)
+
+    monkeypatch.setattr(SlamSystem, "_reveal", spy)
+    ran = go(footage().folder, *AGAIN)
+    assert ran.code == 0, ran.err
+    plain, keyframes = kept[1]
+    assert plain and plain <= keyframes
 
 
 def test_without_doubt_footage_is_tracked_once(go, footage, watched):
@@ -160,34 +195,58 @@ def test_a_users_mask_holds_in_both(go, footage, watched, tmp_path):
     assert ran.code == 0, ran.err
     assert ran.manifest["sweeps"] == 2
     two = watched[1]
-    assert all(mask[:, 121:].all() and mask[:, 10].any() for mask in two.covered[:1])
-    for mask in two.revealed:
+    assert two.tracked[0][:, 121:].all() and two.tracked[0][:, 10].any()
+    for mask in two.adjusted:
         assert mask[:, 121:].all()
         assert not mask[:, :118].any()
-    assert float(two.system.store["unmasked"][..., 16:].max()) == 0.0
+    assert float(two.unmasked[..., 16:].max()) == 0.0
 
 
-@pytest.mark.parametrize("stage", ["track", "finish"])
+@pytest.mark.parametrize("error", [RuntimeError("no more"), KeyboardInterrupt()])
+@pytest.mark.parametrize(
+    ("owner", "stage"), [(_Run, "_build"), (SlamSystem, "track"), (SlamSystem, "finish")]
+)
 def test_what_was_found_first_stays_if_the_second_time_fails(
-    go, footage, watched, monkeypatch, stage
+    go, footage, watched, monkeypatch, owner, stage, error
 ):
     plain = go(footage(name="a").folder, *LEARNED, "frontend.again_below=0", to="to-a")
-    real, calls = getattr(SlamSystem, stage), []
+    real, calls = getattr(owner, stage), []
 
     def second_time(self, *arguments, **options):
         calls.append(self)
         if len(calls) == 2:
-            raise RuntimeError("no more")
+            raise error
         return real(self, *arguments, **options)
 
-    monkeypatch.setattr(SlamSystem, stage, second_time)
+    monkeypatch.setattr(owner, stage, second_time)
     ran = go(footage(name="b").folder, *AGAIN, to="to-b")
     assert ran.code == 0, ran.err
-    assert ran.manifest["sweeps"] == 1
-    assert "no more" in ran.warnings
+    assert (ran.manifest["sweeps"], ran.manifest["kept_sweep"]) == (2, 1)
+    assert "what was found first is kept" in ran.warnings
+    assert (str(error) or "KeyboardInterrupt") in ran.warnings
     assert (ran.folder / "trajectory.tum").read_bytes() == (
         plain.folder / "trajectory.tum"
     ).read_bytes()
+
+
+def test_frames_that_cannot_be_read_again_are_not_lost(go, footage, monkeypatch):
+    clip, finish, calls = footage(), SlamSystem.finish, []
+
+    def finished(self, reread, *, brief=False):
+        found = finish(self, reread, brief=brief)
+        closing(self)
+        if not calls:
+            for picture in sorted((clip.folder / "rgb").glob("*.png"))[-8:]:
+                picture.unlink()
+        calls.append(self)
+        return found
+
+    monkeypatch.setattr(SlamSystem, "finish", finished)
+    ran = go(clip.folder, *AGAIN)
+    assert ran.code == 0, ran.err
+    assert len(ran.poses) == 26
+    assert ran.manifest["kept_sweep"] == 1
+    assert "18 of 26 frames" in ran.warnings
 
 
 def test_the_first_is_gone_while_the_second_tracks(go, footage, monkeypatch):
@@ -223,5 +282,6 @@ def test_an_outcome_that_agrees_much_less_is_left(go, footage, monkeypatch):
     monkeypatch.setattr(SlamSystem, "finish", worse)
     ran = go(footage().folder, *AGAIN)
     assert len(calls) == 2
-    assert ran.manifest["sweeps"] == 1
+    assert (ran.manifest["sweeps"], ran.manifest["kept_sweep"]) == (2, 1)
+    assert "30 %" in ran.warnings
     assert ran.manifest["agreement"] == 0.6

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from droidw.slam.frame import Frame
     from droidw_plugins.correspondence.flow import FlowOptions
 
+_Pair = tuple[tuple[int, int], tuple[int, int]]  # keys of both frames
 # Keyframes whose flow from the one before is kept at full size, from the motion filter until an
 # edge wants it: so many that what is found does not depend on how far ahead the filter has run.
 _FULL_FIELDS = 64
@@ -56,9 +57,9 @@ class FlowCorrespondence:
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
         self._local = threading.local()
         self._lock = threading.Lock()
-        self._latest: tuple[tuple[int, int], Array] | None = None
-        self._full: OrderedDict[tuple[int, int], Array] = OrderedDict()
-        self._grid: OrderedDict[tuple[int, int], Array] = OrderedDict()
+        self._latest: tuple[_Pair, Array] | None = None
+        self._full: OrderedDict[_Pair, Array] = OrderedDict()
+        self._grid: OrderedDict[_Pair, Array] = OrderedDict()
         self._pairs: OrderedDict[tuple[Hashable, ...], tuple[Edge, Edge]] = OrderedDict()
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
@@ -79,7 +80,7 @@ class FlowCorrespondence:
 
     def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:
         """Nothing more is needed of a keyframe; the flow that made it one is kept for its edge."""
-        if self._latest is not None and self._latest[0][1] == payload.index:
+        if self._latest is not None and self._latest[0][1] == payload.key:
             key, flow = self._latest
             with self._lock:
                 self._full[key] = flow
@@ -98,7 +99,7 @@ class FlowCorrespondence:
             return Motion(0.0, 0.0)  # a blank picture agrees with whatever is as bright
         start = None if self._track is None else self._track.ahead(reference, current)
         flow = self._search(reference, current, start)
-        self._latest = (reference.index, current.index), flow
+        self._latest = (reference.key, current.key), flow
         moved = self._moved(reference, current, lambda a, b: flow)
         motion = self._motion(moved, self._agreement(reference, current, moved), reference)
         known = motion.matched > _TRACKED
@@ -147,14 +148,14 @@ class FlowCorrespondence:
     def _free(self, a: FlowFrame, b: FlowFrame) -> Array:
         """Flow a -> b without geometry: the motion filter's, where it made b a keyframe."""
         with self._lock:
-            flow = self._full.get((a.index, b.index))
+            flow = self._full.get((a.key, b.key))
         return self._search(a, b) if flow is None else flow
 
     def _moved(
         self, a: FlowFrame, b: FlowFrame, search: Callable[[FlowFrame, FlowFrame], Array]
     ) -> Array:
         """Displacement [h,w,2] px at the cells."""
-        key = (a.index, b.index)
+        key = (a.key, b.key)
         with self._lock:
             known = self._grid.get(key)
         if known is not None:
@@ -214,7 +215,7 @@ class FlowCorrespondence:
         """
         c, d = bridged
         again = c.bridged is not None or d.bridged is not None
-        key = (a.index, b.index, fine, _bits(c), _bits(d))
+        key = (a.key, b.key, fine, _bits(c), _bits(d))
         with self._lock:
             known = self._pairs.get(key)
         if known is not None and all(

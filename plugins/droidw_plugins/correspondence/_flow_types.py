@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import zlib
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,7 @@ class FlowFrame:
         normal: [h,w,2] unit vector across the strongest edge, x and y.
         centres: [h,w,2] of the cells, pixels.
         covered: [H,W] what the user's mask covers: `grey` is a smooth bridge there; None: nothing.
+        key: tells frames apart, and pictures of one frame with different masks.
         bridged: [h,w] cells over which `grey` is a smooth bridge, see `_flow_mask`; None: nowhere.
     """
 
@@ -40,6 +42,11 @@ class FlowFrame:
     stride: int
     covered: npt.NDArray[np.bool_] | None = None
     bridged: npt.NDArray[np.bool_] | None = None
+    key: tuple[int, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        cover = 0 if self.covered is None else zlib.crc32(np.packbits(self.covered).tobytes())
+        object.__setattr__(self, "key", (self.index, cover))
 
 
 @dataclass
