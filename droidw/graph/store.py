@@ -28,6 +28,8 @@ class KeyframeInfo:
         image: [H,W,3] uint8 RGB at working size.
         payload: what the correspondence op keeps; opaque.
         disp_full: [H,W] float32, or None where correspondence does not enlarge maps itself.
+        whole: payload and field `unmasked` [h,w] of the whole picture, where something of it is
+            hidden while it is tracked; else None.
     """
 
     index: int
@@ -36,6 +38,7 @@ class KeyframeInfo:
     image: npt.NDArray[np.uint8]
     payload: Any
     disp_full: npt.NDArray[np.float32] | None = None
+    whole: tuple[Any, Tensor] | None = None
 
 
 class KeyframeStore:

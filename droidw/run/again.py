@@ -73,7 +73,7 @@ def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden | None
     """
     agreement = outcome.diagnosis.agreement
     # NaN, where nothing was adjusted, is no reason.
-    if not (agreement < below or (below == 1.0 and agreement == 1.0)):
+    if not (agreement < below or below == agreement == 1.0):
         return None
     store, grid = system.store, system.grid
     size = (system.camera.width, system.camera.height)

@@ -166,9 +166,6 @@ class _Run:
             )
 
         system = build(None)
-        self.setup = facts_of_setup(
-            self.resolved, self.device, self.context.weights_dir, system.parts
-        )
         self.built = time.perf_counter()
 
         passes = chain([chain([first], pictures)], iter(source.frames, None))
@@ -188,6 +185,9 @@ class _Run:
         hidden = None
         if failure is None and not self.stop.signum:
             hidden = to_hide(system, outcome, self.config.frontend.again_below)
+        self.setup = facts_of_setup(
+            self.resolved, self.device, self.context.weights_dir, system.parts
+        )
         # What it measured is not needed any more, and the second time needs the room.
         del system
         if hidden is not None:

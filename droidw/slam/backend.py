@@ -95,8 +95,8 @@ class Backend:
                 )
             if number == len(options.passes) - 1:
                 self._upsample(session, shown)
-                rows = list(range(edges))
-                self.agreement = explained_share(store, graph, rows, self.optimiser.gates())
+                gates = self.optimiser.gates()
+                self.agreement = explained_share(store, graph, graph.select(), gates)
         return edges
 
     def _solver(self, number: int, wide: bool) -> SolverConfig:

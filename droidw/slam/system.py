@@ -115,8 +115,6 @@ class SlamSystem:
         self._matched: list[float] = []
         self._kept: dict[int, object] = {}
         self._hidden = hidden or (lambda index: None)
-        # What global adjustment sees of keyframes of which something is hidden, by index.
-        self._plain: dict[int, tuple[object, Tensor]] = {}
         self._room = config.filler.cache_mb * 1e6
 
     @property
@@ -185,8 +183,8 @@ class SlamSystem:
         frame = current.frame
         made = current.payload, current.context, current.features, current.prior
         plain = current.plain
-        hidden = () if plain is None else (plain.payload, plain.context)
-        self._ahead.take(current.ready, made, hidden)
+        whole = None if plain is None else (plain.payload, plain.context)
+        self._ahead.take(current.ready, made, whole)
         self._times.append(frame.time)
         self._indices.append(frame.index)
         if verdict.motion is not None:
@@ -214,7 +212,6 @@ class SlamSystem:
             infos = list(self.store.infos)
             dropped = self.frontend.grow(forced)
         if dropped is not None:
-            self._plain.pop(infos[dropped].index, None)
             self.events.emit(KeyframeRemoved(dropped, infos[dropped].index))
         self._filter.settled(current.frame.index, dropped != number)
         return dropped != number
@@ -225,16 +222,16 @@ class SlamSystem:
         features = self._features(frame) if current.features is None else current.features
         prior = self._prior(frame) if current.prior is None else current.prior
         pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
-        known = {"unmasked": self._unmasked(frame)}
+        info = KeyframeInfo(
+            frame.index, frame.time, frame.name, pixels.cpu().numpy(), current.context
+        )
         if current.plain is not None:
-            plain = current.plain
-            self._plain[frame.index] = plain.context, self._unmasked(plain.frame)
+            info.whole = current.plain.context, self._unmasked(current.plain.frame)
+        known = {"unmasked": self._unmasked(frame)}
         if self.optimiser.begins and not self.frontend.initialised:
             known["movable"] = self._movable(frame)
         number = store.append(
-            KeyframeInfo(
-                frame.index, frame.time, frame.name, pixels.cpu().numpy(), current.context
-            ),
+            info,
             T_cw=pose,
             disps=disp,
             features=features,
@@ -319,10 +316,9 @@ class SlamSystem:
     def _reveal(self) -> None:
         """From now on nothing is hidden: matches are made with whole pictures."""
         for number, info in enumerate(self.store.infos):
-            plain = self._plain.get(info.index)
-            if plain is not None:
-                info.payload, self.store["unmasked"][number] = plain
-        self._plain.clear()
+            if info.whole is not None:
+                info.payload, self.store["unmasked"][number] = info.whole
+                info.whole = None
 
     def _refined(self, focal: FocalSearch | None) -> None:
         """Take over the focal length that global adjustment found."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import weakref
 from dataclasses import replace
 from types import SimpleNamespace
@@ -110,7 +111,20 @@ def closing(system, share=0.4):
 
 
 @pytest.fixture
-def watched(monkeypatch):
+def shut(monkeypatch):
+    """Every system has something to hide once it is finished."""
+    finish = SlamSystem.finish
+
+    def finished(self, reread, *, brief=False):
+        found = finish(self, reread, brief=brief)
+        closing(self)
+        return found
+
+    monkeypatch.setattr(SlamSystem, "finish", finished)
+
+
+@pytest.fixture
+def watched(shut, monkeypatch):
     """Every system that a run finishes, and what is covered of its pictures in each stage."""
     made = []
     finish, adjust, fill = SlamSystem.finish, Backend.run, Filler.fill
@@ -121,9 +135,7 @@ def watched(monkeypatch):
     def finished(self, reread, *, brief=False):
         seen = covered(info.payload for info in self.store.infos)
         made.append(SimpleNamespace(system=self, tracked=seen, filled=[]))
-        found = finish(self, reread, brief=brief)
-        closing(self)
-        return found
+        return finish(self, reread, brief=brief)
 
     def adjusted(self, tell):
         made[-1].adjusted = covered(info.payload for info in made[-1].system.store.infos)
@@ -155,19 +167,29 @@ def test_pictures_are_whole_again_once_all_is_tracked(go, footage, watched, cach
     assert len(ran.poses) == 26
 
 
-def test_nothing_is_kept_of_keyframes_that_are_dropped(go, footage, monkeypatch):
-    reveal, kept = SlamSystem._reveal, []
+def test_nothing_is_kept_of_keyframes_that_are_dropped(go, footage, shut, monkeypatch):
+    append, reveal, plain, kept = SlamSystem._append, SlamSystem._reveal, {}, []
 
-    def spy(self):
-        kept.append((set(self._plain), {info.index for info in self.store.infos}))
-        closing(self)
+    def added(self, current):
+        if current.plain is not None:
+            plain[current.frame.index] = weakref.ref(current.plain.context)
+        return append(self, current)
+
+    def revealed(self):
+        # The motion filter goes on from the last candidate, dropped or not.
+        held = {info.index for info in self.store.infos} | {self._filter._reference.frame.index}
+        gc.collect()
+        kept.append(({index for index, context in plain.items() if context() is not None}, held))
         reveal(self)
 
-    monkeypatch.setattr(SlamSystem, "_reveal", spy)
-    ran = go(footage().folder, *AGAIN)
+    monkeypatch.setattr(SlamSystem, "_append", added)
+    monkeypatch.setattr(SlamSystem, "_reveal", revealed)
+    often = "motion_filter.threshold=0.3", "frontend.keyframe_threshold=2.5"
+    ran = go(footage().folder, *AGAIN, "filler.cache_mb=0", *often)
     assert ran.code == 0, ran.err
-    plain, keyframes = kept[1]
-    assert plain and plain <= keyframes
+    alive, held = kept[1]
+    assert alive and alive <= held
+    assert set(plain) - held
 
 
 def test_without_doubt_footage_is_tracked_once(go, footage, watched):
@@ -229,12 +251,11 @@ def test_what_was_found_first_stays_if_the_second_time_fails(
     ).read_bytes()
 
 
-def test_frames_that_cannot_be_read_again_are_not_lost(go, footage, monkeypatch):
+def test_frames_that_cannot_be_read_again_are_not_lost(go, footage, shut, monkeypatch):
     clip, finish, calls = footage(), SlamSystem.finish, []
 
     def finished(self, reread, *, brief=False):
         found = finish(self, reread, brief=brief)
-        closing(self)
         if not calls:
             for picture in sorted((clip.folder / "rgb").glob("*.png"))[-8:]:
                 picture.unlink()
@@ -249,32 +270,25 @@ def test_frames_that_cannot_be_read_again_are_not_lost(go, footage, monkeypatch)
     assert "18 of 26 frames" in ran.warnings
 
 
-def test_the_first_is_gone_while_the_second_tracks(go, footage, monkeypatch):
-    track, finish, built, alive = SlamSystem.track, SlamSystem.finish, [], []
+def test_the_first_is_gone_while_the_second_tracks(go, footage, shut, monkeypatch):
+    track, built, alive = SlamSystem.track, [], []
 
     def spy(self, frames):
         alive.append([one() is not None for one in built])
         built.append(weakref.ref(self))
         track(self, frames)
 
-    def finished(self, reread, *, brief=False):
-        found = finish(self, reread, brief=brief)
-        closing(self)
-        return found
-
     monkeypatch.setattr(SlamSystem, "track", spy)
-    monkeypatch.setattr(SlamSystem, "finish", finished)
     ran = go(footage().folder, *AGAIN)
     assert ran.code == 0, ran.err
     assert alive == [[], [False]]
 
 
-def test_an_outcome_that_agrees_much_less_is_left(go, footage, monkeypatch):
+def test_an_outcome_that_agrees_much_less_is_left(go, footage, shut, monkeypatch):
     finish, calls = SlamSystem.finish, []
 
     def worse(self, reread, *, brief=False):
         found = finish(self, reread, brief=brief)
-        closing(self)
         calls.append(self)
         agreement = 0.6 if len(calls) == 1 else 0.3
         return replace(found, diagnosis=replace(found.diagnosis, agreement=agreement))

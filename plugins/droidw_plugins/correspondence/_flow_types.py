@@ -28,7 +28,7 @@ class FlowFrame:
             eigenvalues of the structure tensor, larger first, (grey levels per pixel)^2.
         normal: [h,w,2] unit vector across the strongest edge, x and y.
         centres: [h,w,2] of the cells, pixels.
-        covered: [H,W] what the user's mask covers: `grey` is a smooth bridge there; None: nothing.
+        covered: [H,W] what the frame's mask covers: `grey` is a smooth bridge there; None: nothing.
         key: tells frames apart, and pictures of one frame with different masks.
         bridged: [h,w] cells over which `grey` is a smooth bridge, see `_flow_mask`; None: nowhere.
     """
