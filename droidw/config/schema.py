@@ -108,6 +108,12 @@ class SolverConfig:
         "`cauchy` at most (0: always `cauchy`)",
         ge=0,
     )
+    cauchy_slip: float = opt(
+        0.0,
+        "share of a residual's whole length that this kernel counts besides its length in the "
+        "directions in which the match is known: gives up what has slipped along a line",
+        ge=0,
+    )
     guard: bool = opt(False, "shorten or reject a step that raises the energy")
 
 
@@ -282,12 +288,14 @@ class DroidwConfig:
             "help": "phases: init_blind, init, init_again, window, window_kept, global, fill"
         },
     )
-    solver: SolverConfig = field(default_factory=lambda: SolverConfig(cauchy=0.15))
+    solver: SolverConfig = field(default_factory=lambda: SolverConfig(cauchy=0.15, cauchy_slip=1.0))
     global_solver: SolverConfig = field(
-        default_factory=lambda: SolverConfig(lm=1e-6, ep=1e-4, cauchy=0.75, cauchy_tuning=5.0)
+        default_factory=lambda: SolverConfig(
+            lm=1e-6, ep=1e-4, cauchy=0.75, cauchy_tuning=5.0, cauchy_slip=2.0
+        )
     )
     filler_solver: SolverConfig = field(
-        default_factory=lambda: SolverConfig(cauchy=0.15, cauchy_tuning=0.5)
+        default_factory=lambda: SolverConfig(cauchy=0.15, cauchy_tuning=0.5, cauchy_slip=0.5)
     )
 
     device: str = opt("auto", "auto, cpu, cuda, cuda:N")

@@ -150,14 +150,15 @@ class Frontend:
         """The solver of initialisation: with its Cauchy kernel where it is known what can move.
 
         Where that is not known, the kernel would hold on to whatever most of the texture is on,
-        which may well be what moves, and give up the rest.
+        which may well be what moves, and give up the rest. Nor can it give up what has slipped
+        along a line: poses begin with nothing, and by them everything has.
         """
         solver = self.config.solver
         if solver.cauchy == 0:
             return solver
         closed = self.optimiser.gates(learned=True) < 0.5
         known = float(closed.float().mean()) > _KNOWN_MOVERS
-        return solver if known else replace(solver, cauchy=0.0)
+        return replace(solver, cauchy_slip=0.0) if known else replace(solver, cauchy=0.0)
 
     def _phase(self, name: str) -> PhaseConfig:
         """A row of the schedule; uncertainty that begins with something weighs from the first."""

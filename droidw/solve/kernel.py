@@ -28,7 +28,9 @@ _LEAST, _MOST = -30, 20
 _NARROWEST = 1e-3
 
 
-def redescend(weight: Tensor, residual: Tensor, scale: float | Tensor) -> Tensor:
+def redescend(
+    weight: Tensor, residual: Tensor, scale: float | Tensor, slip: float = 0.0
+) -> Tensor:
     """Weights times those of a Cauchy kernel, `1 / (1 + (s / scale)^2)`.
 
     The further a measurement lies from what the poses predict, the less it pulls: a Huber kernel
@@ -39,13 +41,18 @@ def redescend(weight: Tensor, residual: Tensor, scale: float | Tensor) -> Tensor
         residual: [E,h,w,2] measured less predicted position, cells.
         scale: s at which a weight halves, cells, > 0, of all or [E] of each edge; s as of
             `BAProblem.huber`, so that a match is judged in the directions in which it is known.
+        slip: share of the whole length of a residual that counts besides, >= 0. What has slipped
+            along a line is off across it, too, wherever the line bends or turns.
     Returns:
         The shape of `weight`, a fresh tensor. Where residual or weight is not finite, the weight is
         as it was: bundle adjustment counts and drops those.
     """
     if not isinstance(scale, float):
         scale = scale[:, None, None]
-    factor = (1.0 + _square(weight, residual) / scale**2).reciprocal()
+    square = _square(weight, residual)
+    if slip > 0:
+        square = square + slip**2 * residual.square().sum(-1)
+    factor = (1.0 + square / scale**2).reciprocal()
     return weight * torch.where(torch.isfinite(factor), factor, 1.0)[..., None]
 
 
@@ -95,13 +102,14 @@ def redescended(
         return problem
     coords, _ = reproject(problem.T_cw, problem.disps, problem.intrinsics, problem.ii, problem.jj)
     residual = problem.target - coords
-    if solver.cauchy_tuning == 0:
-        return replace(problem, weight=redescend(problem.weight, residual, float(solver.cauchy)))
-    typical = median_length(problem.weight, residual, group, groups)
     widest = float(solver.cauchy)
-    width = (solver.cauchy_tuning * typical).clamp(min(_NARROWEST, widest), widest)
-    width = width.expand(len(residual)) if group is None else width[group]
-    return replace(problem, weight=redescend(problem.weight, residual, width))
+    width: float | Tensor = widest
+    if solver.cauchy_tuning > 0:
+        typical = median_length(problem.weight, residual, group, groups)
+        width = (solver.cauchy_tuning * typical).clamp(min(_NARROWEST, widest), widest)
+        width = width.expand(len(residual)) if group is None else width[group]
+    weight = redescend(problem.weight, residual, width, solver.cauchy_slip)
+    return replace(problem, weight=weight)
 
 
 def _mean(weight: Tensor) -> Tensor:

@@ -35,13 +35,16 @@ PAPER = {
         "updates": 0, "iterations": 2, "learn": False, "weigh": True, "depth_prior": False,
     },
     "solver": {
-        "lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0, "guard": False,
+        "lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0,
+        "cauchy_slip": 0.0, "guard": False,
     },
     "global_solver": {
-        "lm": 1e-5, "ep": 1e-2, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0, "guard": False,
+        "lm": 1e-5, "ep": 1e-2, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0,
+        "cauchy_slip": 0.0, "guard": False,
     },
     "filler_solver": {
-        "lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0, "guard": False,
+        "lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0,
+        "cauchy_slip": 0.0, "guard": False,
     },
     "seed": 43, "compat": [], "camera.refine_focal": False,
 }  # fmt: skip

@@ -71,8 +71,9 @@ def test_far_matches_are_given_up_at_first_only_where_it_is_known_what_can_move(
     gates = torch.ones(8, 10, 10)
     gates.view(-1)[: round(closed * gates.numel())] = 0.1
     frontend = Frontend.__new__(Frontend)
-    frontend.config = SimpleNamespace(solver=SolverConfig(huber=0.2, cauchy=0.15))
+    frontend.config = SimpleNamespace(solver=SolverConfig(huber=0.2, cauchy=0.15, cauchy_slip=1.0))
     frontend.optimiser = SimpleNamespace(gates=lambda learned: gates)
     solver = frontend._first_solver()
     assert solver.cauchy == cauchy
+    assert cauchy == 0 or solver.cauchy_slip == 0  # along lines everything slips at first
     assert solver.huber == 0.2

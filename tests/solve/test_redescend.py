@@ -28,6 +28,15 @@ def test_a_match_is_judged_in_the_directions_in_which_it_is_known() -> None:
     assert torch.allclose(weight[0, 0, 1], 0.5 * across[0, 0, 1])
 
 
+def test_what_has_slipped_along_a_line_can_be_given_up_too() -> None:
+    across = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64).expand(1, 1, 3, 3)
+    residual = torch.tensor([[[[0.0, 4.0], [0.3, 0.4], [0.0, 0.0]]]], dtype=torch.float64)
+    kept = redescend(across, residual, 1.0, slip=0.5)[0, 0, :, 0]
+    # half of 4 along the line; across it r^T W r / 0.5 = 0.18, and a quarter of 0.25 besides
+    assert kept.tolist() == pytest.approx([1 / 5, 1 / (1 + 0.18 + 0.0625), 1.0])
+    assert torch.equal(redescend(across, residual, 1.0)[0, 0, 0], across[0, 0, 0])
+
+
 def test_the_scale_of_weights_does_not_matter_and_nonsense_stays_to_be_counted() -> None:
     residual = torch.tensor([[[[0.3, 0.4], [float("nan"), 0.0], [1.0, 1.0]]]])
     weight = torch.tensor([[[[1.0, 1.0], [1.0, 1.0], [0.0, 0.0]]]])
