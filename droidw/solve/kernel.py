@@ -28,9 +28,7 @@ _LEAST, _MOST = -30, 20
 _NARROWEST = 1e-3
 
 
-def redescend(
-    weight: Tensor, residual: Tensor, scale: float | Tensor, slip: float = 0.0
-) -> Tensor:
+def redescend(weight: Tensor, residual: Tensor, scale: float | Tensor, slip: float = 0.0) -> Tensor:
     """Weights times those of a Cauchy kernel, `1 / (1 + (s / scale)^2)`.
 
     The further a measurement lies from what the poses predict, the less it pulls: a Huber kernel
