@@ -91,7 +91,8 @@ def redescended(
 
     The kernel is `solver.cauchy` wide; with `solver.cauchy_tuning` that many times `median_length`,
     if that is less. So it is wide as long as poses are far off, and then as narrow as matches are
-    exact. The problem itself where `solver.cauchy` is 0.
+    exact. `solver.cauchy_slip` is the `slip` of `redescend`. The problem itself where
+    `solver.cauchy` is 0.
 
     Args:
         group, groups: edges with a width of their own each, as in `median_length`.
