@@ -9,7 +9,7 @@ import torch
 from droidw.geometry.camera import Grid
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw_plugins.correspondence import flow
-from droidw_plugins.correspondence._flow_information import information, structure, trust
+from droidw_plugins.correspondence._flow_information import information, structure, trust, turned
 from droidw_plugins.correspondence._flow_types import FlowFrame
 
 HEIGHT, WIDTH, STRIDE = 160, 208, 8
@@ -132,6 +132,73 @@ def test_a_match_may_slip_along_an_edge_but_not_off_it():
     assert dict(zip(errors, second, strict=True)) == pytest.approx(
         {"none": 1, "slip": 0, "off": 0, "across": half, "far": 0}, abs=1e-5
     )
+
+
+def rolled(degrees, roll, period=24.0):
+    """Stripes [H,W] of this angle after the picture has turned by `roll` about its middle."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    n = np.deg2rad(degrees + roll)
+    across = (x - (WIDTH - 1) / 2) * np.cos(n) + (y - (HEIGHT - 1) / 2) * np.sin(n)
+    return (128 + 60 * np.sin(2 * np.pi * across / period)).astype(np.float32)
+
+
+def strong_direction(confidence):
+    """Angle [h,w] in degrees, in [-90, 90), in which most is known."""
+    xx, yy, xy = confidence.unbind(-1)
+    return torch.rad2deg(0.5 * torch.atan2(xy, (xx - yy) / 2))
+
+
+@pytest.mark.parametrize("roll", [-6.0, 6.0])
+@pytest.mark.parametrize(("reach", "follows"), [(8, 1.0), (0, 0.0)])
+def test_a_line_that_turns_is_known_across_as_it_then_runs(reach, follows, roll, measured):
+    _, confidence = measured(rolled(20, 0), rolled(20, roll), turn_reach=reach, slide=100.0)
+    middle = (slice(6, -6), slice(8, -8))
+    sure = along(confidence, 20 + roll)[middle] > 0.5
+    assert float(sure.double().mean()) > 0.8
+    found = strong_direction(confidence)[middle][sure]
+    # a picture of stripes alone lets flow slip without end, by much and not evenly
+    assert float(found.median()) == pytest.approx(20 + follows * roll, abs=1.0)
+
+
+def pulled(matrix):
+    """A flow [H,W,2] that maps the picture by this matrix about its middle."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    at = np.stack([x - (WIDTH - 1) / 2, y - (HEIGHT - 1) / 2], -1)
+    return (at @ (np.asarray(matrix) - np.eye(2)).T).astype(np.float32)
+
+
+def some_frame(degrees):
+    centres = GRID.centres().numpy().astype(np.float32)
+    grey = stripes(degrees)
+    return FlowFrame(0, grey.astype(np.uint8), *structure(grey, centres, STRIDE), centres, STRIDE)
+
+
+@pytest.mark.parametrize("degrees", ANGLES)
+def test_the_normal_goes_with_the_flow_however_it_slips(degrees):
+    """A normal is a covector: it goes with the inverse transpose of what the points go with."""
+    payload = some_frame(degrees)
+    matrix = np.array([[1.1, -0.2], [0.15, 0.9]])
+    line = np.array([-payload.normal[..., 1], payload.normal[..., 0]])
+    expected = np.einsum("ij,hwj->hwi", np.linalg.inv(matrix).T, payload.normal)
+    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+    slipped = pulled(matrix) + 3 * (matrix @ line[:, 10, 13]).astype(np.float32)
+    for flow_there in (pulled(matrix), slipped):
+        found = turned(payload, flow_there, 8)[INNER]
+        cosine = np.abs((found * expected[INNER]).sum(-1))
+        np.testing.assert_allclose(cosine, 1.0, atol=1e-4)
+        np.testing.assert_allclose(np.linalg.norm(found, axis=-1), 1.0, rtol=1e-5)
+
+
+@pytest.mark.parametrize("times", [0.4, 2.5])
+def test_what_is_no_longer_like_the_line_keeps_its_normal(times):
+    payload = some_frame(30)
+    collapsed = pulled(np.zeros((2, 2)))  # all points of the line go to one
+    for flow_there in (pulled(times * np.eye(2)), collapsed):
+        assert np.array_equal(turned(payload, flow_there, 8)[INNER], payload.normal[INNER])
+    assert np.array_equal(
+        turned(payload, pulled([[0, -1], [1, 0]]), 8)[INNER], payload.normal[INNER]
+    )
+    assert turned(payload, pulled([[1, 0.2], [0, 1]]), 0) is payload.normal
 
 
 def test_information_is_the_sum_of_both_directions():

@@ -19,6 +19,7 @@ from droidw_plugins.correspondence._flow_information import (
     sample,
     structure,
     trust,
+    turned,
 )
 from droidw_plugins.correspondence._flow_mask import grown, surer, without
 from droidw_plugins.correspondence._flow_polish import polished
@@ -274,7 +275,8 @@ class FlowCorrespondence:
         there = a.centres + moved
         back = sample(ba, there, outside=1e4)
         agreed = trust(moved + back, a.normal, self.options)
-        confidence = information(a, *agreed, self.options)
+        normal = turned(a, ab, self.options.turn_reach)
+        confidence = information(a, *agreed, self.options, normal)
         target = ((there - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, started)
 

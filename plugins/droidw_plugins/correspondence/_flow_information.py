@@ -14,12 +14,15 @@ if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow_types import FlowFrame
     from droidw_plugins.correspondence.flow import FlowOptions
 
-__all__ = ["information", "sample", "structure", "trust"]
+__all__ = ["information", "sample", "structure", "trust", "turned"]
 
 # Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
 _FLAT = 0.1
 # Keeps the power of a flat window from being divided by itself.
 _NOTHING = np.float32(1e-12)
+# How much longer a piece of line may become, and how far it may turn (cosine), to be the same line.
+_LONGER = 2.0
+_TURNED = 0.7
 
 
 def sample(values: Any, points: Array, outside: float | None = None) -> Array:
@@ -92,7 +95,39 @@ def trust(apart: Array, normal: Array, options: FlowOptions) -> tuple[Array, Arr
     return first.astype(np.float32), second.astype(np.float32)
 
 
-def information(frame: FlowFrame, across: Array, along: Array, options: FlowOptions) -> Array:
+def turned(frame: FlowFrame, flow: Array, reach: int) -> Array:
+    """`normal` of a frame as it is where the flow leads: across the line in the other picture.
+
+    A match slips along its line as that runs there. Where the camera rolls or passes a wall, a slip
+    judged by how the line ran here looks like motion across it.
+
+    Args:
+        flow: [H,W,2] pixels. It takes two points of the line with it, however it slips along it.
+        reach: pixels along the line to these points; 0: as it is here.
+    Returns:
+        [h,w,2] unit vectors; as it is here where what becomes of the line is not like it.
+    """
+    if reach == 0:
+        return frame.normal
+    along = np.float32(reach) * np.stack([-frame.normal[..., 1], frame.normal[..., 0]], -1)
+    ahead, behind = (sample(flow, frame.centres + step) for step in (along, -along))
+    there = 2 * along + ahead - behind
+    length = np.maximum(np.hypot(there[..., 0], there[..., 1]), _NOTHING)
+    grown = length / (2 * reach)
+    alike = (grown > 1 / _LONGER) & (grown < _LONGER)
+    alike &= np.abs((there * along).sum(axis=-1)) > _TURNED * reach * length
+    normal = np.stack([there[..., 1], -there[..., 0]], -1) / length[..., None]
+    result: Array = np.where(alike[..., None], normal, frame.normal)
+    return result
+
+
+def information(
+    frame: FlowFrame,
+    across: Array,
+    along: Array,
+    options: FlowOptions,
+    normal: Array | None = None,
+) -> Array:
     """Information (xx, yy, xy) of matches from a frame, [h,w,3] float32.
 
     Along each eigenvector of the structure tensor its eigenvalue says how much of the trust counts:
@@ -103,6 +138,7 @@ def information(frame: FlowFrame, across: Array, along: Array, options: FlowOpti
     Args:
         across, along: [h,w] in [0,1], trust along the first and the second eigenvector.
         options: with `texture` 0 the picture is not asked.
+        normal: [h,w,2] of the first eigenvector in the other picture; None: as in the frame.
     """
     first, second = across, along
     if options.texture > 0:
@@ -112,7 +148,8 @@ def information(frame: FlowFrame, across: Array, along: Array, options: FlowOpti
         leaked = (np.float32(options.edge_leak) * strong) ** 2
         held = weak**2 / np.maximum(weak**2 + leaked, _NOTHING)
         second = along * held * weak / (weak + level)
-    x, y = frame.normal[..., 0], frame.normal[..., 1]
+    normal = frame.normal if normal is None else normal
+    x, y = normal[..., 0], normal[..., 1]
     matrix = np.stack(
         [first * x * x + second * y * y, first * y * y + second * x * x, (first - second) * x * y],
         -1,

@@ -79,6 +79,15 @@ class FlowOptions:
             "ge": 0.0,
         },
     )
+    turn_reach: int = field(
+        default=0,
+        metadata={
+            "help": "pixels along a line to either side at which the flow tells how it runs in the "
+            "other picture, where a match counts across it (0: as it runs in the first one)",
+            "ge": 0,
+            "le": 32,
+        },
+    )
     reach: int = field(
         default=7,
         metadata={
