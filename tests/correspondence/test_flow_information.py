@@ -134,14 +134,6 @@ def test_a_match_may_slip_along_an_edge_but_not_off_it():
     )
 
 
-def rolled(degrees, roll, period=24.0):
-    """Stripes [H,W] of this angle after the picture has turned by `roll` about its middle."""
-    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
-    n = np.deg2rad(degrees + roll)
-    across = (x - (WIDTH - 1) / 2) * np.cos(n) + (y - (HEIGHT - 1) / 2) * np.sin(n)
-    return (128 + 60 * np.sin(2 * np.pi * across / period)).astype(np.float32)
-
-
 def strong_direction(confidence):
     """Angle [h,w] in degrees, in [-90, 90), in which most is known."""
     xx, yy, xy = confidence.unbind(-1)
@@ -151,7 +143,9 @@ def strong_direction(confidence):
 @pytest.mark.parametrize("roll", [-6.0, 6.0])
 @pytest.mark.parametrize(("reach", "follows"), [(8, 1.0), (0, 0.0)])
 def test_a_line_that_turns_is_known_across_as_it_then_runs(reach, follows, roll, measured):
-    _, confidence = measured(rolled(20, 0), rolled(20, roll), turn_reach=reach, slide=100.0)
+    axis = ((WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    before, after = (stripes(20 + angle, axis, (24.0,)) for angle in (0, roll))
+    _, confidence = measured(before, after, turn_reach=reach, slide=100.0)
     middle = (slice(6, -6), slice(8, -8))
     sure = along(confidence, 20 + roll)[middle] > 0.5
     assert float(sure.double().mean()) > 0.8
