@@ -196,6 +196,14 @@ class BackendConfig:
         False, "bring the mean disparity to 1 before each pass, where no depth prior is"
     )
     factors_per_keyframe: int = opt(10, "directed edges per keyframe at most", ge=2)
+    backwards_below: float = opt(
+        0.72,
+        "agreement of all matches with poses and depths below which keyframes are tracked once "
+        "more, from the last to the first, and that is kept if more agrees (0: never, 1: however "
+        "much agrees)",
+        ge=0,
+        le=1,
+    )
 
 
 @dataclass

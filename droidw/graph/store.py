@@ -120,6 +120,25 @@ class KeyframeStore:
         """Views of the fields that parts asked for."""
         return {name: self[name] for name in self._own}
 
+    def blank(self) -> KeyframeStore:
+        """A store for keyframes of the same camera with the same fields, without any yet."""
+        features = self._data["features"]
+        own = [self._declared[name] for name in self._own]
+        store = KeyframeStore(
+            self.grid,
+            self.image_intrinsics,
+            features.shape[1],
+            own,
+            self.device,
+            features.dtype,
+        )
+        store.intrinsics = self.intrinsics.clone()
+        return store
+
+    def values(self, index: int) -> dict[str, Tensor]:
+        """All fields of keyframe `index`, views."""
+        return {name: self[name][index] for name in self._declared}
+
     def append(self, info: KeyframeInfo, **values: Tensor) -> int:
         """Add a keyframe and return its number; fields not given hold their fill value."""
         n = len(self.infos)

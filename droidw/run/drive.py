@@ -163,6 +163,7 @@ class _Run:
                 focal_known=not guessed,
                 hidden=hidden,
                 clock=self.clock,
+                stopped=lambda: self.stop.signum > 0,
             )
 
         system = build(None)

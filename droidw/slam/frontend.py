@@ -96,6 +96,13 @@ class Frontend:
         self._solver = self.config.solver
         self.initialised = True
 
+    def resume(self) -> None:
+        """Go on from keyframes whose poses and depths are known, as after `initialise`."""
+        self.graph.add(neighbour_edges(len(self.store), 3))
+        self._updates("init", first_free=1)
+        self._recent = 4
+        self.initialised = True
+
     def release(self) -> None:
         """Drop what correspondence holds of the window; nothing can be grown afterwards."""
         self.session.forget(list(self.graph.ids))

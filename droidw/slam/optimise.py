@@ -80,6 +80,7 @@ class Optimiser:
         self.parts = parts
         self.weighting = weighting
         self.clock = clock
+        self._published = published
         self._calibrate = (
             weighting.similarity == "matched"
             and not published
@@ -92,6 +93,17 @@ class Optimiser:
         self.iterations = 0
         self.reports: dict[str, int] = {}
         self.cost = float("nan")
+
+    def beside(self, store: KeyframeStore) -> Optimiser:
+        """The same for another store, whose uncertainty begins with what this one has learned."""
+        other = Optimiser(store, self.parts, self.weighting, self.clock, self._published)
+        other.begun = self.begun
+        return other
+
+    def add_reports(self, other: Optimiser) -> None:
+        """Count steps of the other that were left out as steps of this one."""
+        for status, count in other.reports.items():
+            self.reports[status] = self.reports.get(status, 0) + count
 
     def begin(self) -> None:
         """Let uncertainty start from what features say of the keyframes so far, if it wants to."""

@@ -19,6 +19,7 @@ from droidw.geometry.se3 import inv
 from droidw.geometry.transfer import upload
 from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.slam.backend import Backend
+from droidw.slam.backwards import doubted
 from droidw.slam.cloud import consistent_depth, static_cloud
 from droidw.slam.diagnosis import diagnose, parallax
 from droidw.slam.filler import Filler
@@ -58,6 +59,7 @@ class SlamSystem:
         hidden: index of a frame -> [H,W] True where its picture is ignored while tracking, or None;
             global adjustment and the filler see all of it.
         clock: where the time of each stage is added up.
+        stopped: asked now and then whether the run is to end soon.
     Attributes:
         camera: the working camera, after `finish` with the focal length that was found.
         focal: what the search for that came to, None where there was none.
@@ -75,6 +77,7 @@ class SlamSystem:
         focal_known: bool = True,
         hidden: Callable[[int], npt.NDArray[np.bool_] | None] | None = None,
         clock: Stopwatch | None = None,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         self.config = config
         self.parts = parts
@@ -83,6 +86,7 @@ class SlamSystem:
         self._focal_known = focal_known
         self.events = events or Dispatcher()
         self.clock = clock or Stopwatch()
+        self._stopped = stopped
         op = parts.correspondence
         self.grid = Grid.of(camera.height, camera.width, op.stride, op.offset)
         # The published code takes depth and features from pixel 8 x + 3, but its rays from 8 x.
@@ -290,6 +294,8 @@ class SlamSystem:
                 backend.run(lambda done, total: self.events.emit(Progress("global", done, total)))
                 self._refined(backend.focal)
                 found = replace(found, agreement=backend.agreement)
+            with self.clock("backwards"):
+                found = doubted(self.optimiser, self.config, found, self.events, self._stopped)
         with self.clock("fill"):
             trajectory = self._trajectory(reread, quick=brief or found.still)
         self._kept.clear()
@@ -329,8 +335,7 @@ class SlamSystem:
 
     def _hold_still(self) -> None:
         """A camera at rest: every pose is the first, and no depth can be known."""
-        first = self.store.T_cw[0].clone()
-        self.store.T_cw.copy_(first.expand_as(self.store.T_cw))
+        self.store.T_cw.copy_(self.store.T_cw[:1].clone().expand_as(self.store.T_cw))
 
     def _trajectory(self, reread: Callable[[], Iterable[Frame]], quick: bool) -> Trajectory:
         filler = Filler(self.optimiser, self.config)

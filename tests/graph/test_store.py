@@ -101,3 +101,20 @@ def test_removing_what_is_not_there(at):
 def test_two_fields_of_one_name():
     with pytest.raises(ValueError, match="declared twice"):
         KeyframeStore(GRID, torch.ones(4), 0, (StoreField("disps", ("h",)),))
+
+
+def test_a_blank_store_is_alike_and_takes_keyframes_as_they_are():
+    store = empty()
+    for tag in (3, 4, 5):
+        append(store, tag)
+    store.intrinsics *= 1.1
+    other = store.blank()
+    assert len(other) == 0
+    assert torch.equal(other.intrinsics, store.intrinsics)
+    assert list(other.extra()) == list(store.extra())
+    for index in (2, 0):
+        other.append(store.infos[index], **store.values(index))
+    assert all(held == [5, 3] for held in tags(other).values())
+    assert other["count"].dtype == torch.int64
+    other.T_cw.zero_()
+    assert all(held == [3, 4, 5] for held in tags(store).values())

@@ -23,7 +23,12 @@ from droidw.events import (
 
 __all__ = ["ProgressLine", "memory_mib"]
 
-_LABELS = {"global": "global bundle adjustment", "fill": "poses of all frames", "export": "export"}
+_LABELS = {
+    "global": "global bundle adjustment",
+    "backwards": "keyframes backwards",
+    "fill": "poses of all frames",
+    "export": "export",
+}
 _REFRESH = 0.1
 _WINDOW = 5.0
 _EVENTS = 30

@@ -142,8 +142,9 @@ def _tiles(result: RunResult, paths: Paths, metrics: Mapping[str, Any]) -> str:
         )
     agreement = number(manifest.get("agreement"))
     if agreement is not None:
-        twice = "tracked twice" if manifest.get("sweeps") == 2 else ""
-        tiles.append(tile(f"{100 * agreement:.0f}", "%", "of matches agree", twice))
+        told = ["tracked twice"] if manifest.get("sweeps") == 2 else []
+        told += ["backwards in the end"] if manifest.get("backwards") else []
+        tiles.append(tile(f"{100 * agreement:.0f}", "%", "of matches agree", ", ".join(told)))
     ate = number(metrics.get("ate_rmse"))
     unit = str(metrics.get("unit", paths.unit or "m"))
     if ate is None and len(paths.errors):
