@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING
 
 from droidw.events import Dispatcher, Progress
 from droidw.geometry.se3 import inv, mul
-from droidw.graph.store import KeyframeStore
+from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.slam.backend import Backend
 from droidw.slam.frontend import Frontend
 from droidw.slam.optimise import Optimiser
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from droidw.config.schema import DroidwConfig
     from droidw.slam.diagnosis import Diagnosis
 
@@ -33,7 +35,7 @@ class WayBack:
     """The keyframes of a run, last first, tracked in that order.
 
     Attributes:
-        store: poses and depths are new, the rest is that of the run.
+        store: poses, depths and uncertainty are new, the rest is that of the run.
         agreement: as of `Backend`.
     """
 
@@ -41,10 +43,11 @@ class WayBack:
     agreement: float
 
     def write_to(self, store: KeyframeStore) -> None:
-        """Let the run have these poses and depths; its first pose stays what it was."""
+        """Let the run have all of this; its first pose stays what it was."""
         T_cw, first = self.store.T_cw.flip(0), store.T_cw[:1].clone()
         store.write(mul(mul(T_cw, inv(T_cw[:1])), first), self.store.disps.flip(0))
-        store["damping"].copy_(self.store["damping"].flip(0))
+        for name in ("damping", "uncertainty", *store.extra()):
+            store[name].copy_(self.store[name].flip(0))
         for info, other in zip(store.infos, reversed(self.store.infos), strict=True):
             info.disp_full = other.disp_full
 
@@ -81,7 +84,8 @@ def doubted(
         events.emit(Progress("backwards", done, total))
 
     try:
-        back = track_backwards(optimiser, config, tell, stopped)
+        with optimiser.clock("backwards"):
+            back = track_backwards(optimiser, config, tell, stopped)
     except Exception as error:  # noqa: BLE001 - what was found forwards is as good as it was
         why = str(error) or type(error).__name__
         events.warn(f"the keyframes could not be tracked backwards, what was found is kept: {why}")
@@ -105,7 +109,7 @@ def track_backwards(
     """Track the keyframes of a run from the last one to the first, and adjust them globally.
 
     It sets off from the last poses and depths of the run. No keyframe is dropped, and uncertainty
-    stays as it has learned to be.
+    goes on learning from what it knows.
 
     Args:
         optimiser: of the run, whose store is left as it is.
@@ -118,11 +122,10 @@ def track_backwards(
     count, first = len(known), config.frontend.warmup
     if count <= first:
         return None
-    schedule = {name: replace(row, learn=False) for name, row in config.schedule.items()}
-    camera = replace(config.camera, refine_focal=False)
-    config = replace(config, schedule=schedule, camera=camera)
+    config = replace(config, camera=replace(config.camera, refine_focal=False))
     store = known.blank()
-    frontend = Frontend(optimiser.beside(store), config)
+    beside = optimiser.beside(store)
+    frontend = Frontend(beside, config)
     steps = sum(config.backend.passes)
 
     def told(done: int) -> None:
@@ -138,18 +141,29 @@ def track_backwards(
             values = known.values(node)
             if done >= first:
                 values["T_cw"], values["disps"] = frontend.guess(info.time)
-            store.append(info, **values)
+            _append(beside, info, values)
             if done == first - 1:
                 frontend.resume()
             elif done >= first:
                 frontend.grow(forced=True)
         frontend.release()
-        backend = Backend(frontend.optimiser, config)
+        backend = Backend(beside, config)
         backend.run(lambda done, total: told(count + done))
     except _Stopped:
         return None
-    optimiser.add_reports(frontend.optimiser)
+    optimiser.add_reports(beside)
     return WayBack(store, backend.agreement)
+
+
+def _append(optimiser: Optimiser, info: KeyframeInfo, values: dict[str, Tensor]) -> None:
+    """Append a keyframe with all that is known of it."""
+    store, uncertainty = optimiser.store, optimiser.parts.uncertainty
+    number = store.append(info, **values)
+    # It is told that the number means another keyframe now, and what it makes of that is less
+    # than what it has learned.
+    uncertainty.append(optimiser.view(), number)
+    for name in ("uncertainty", *store.extra()):
+        store[name][number] = values[name]
 
 
 class _Stopped(Exception):

@@ -14,6 +14,7 @@ from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
 from droidw.geometry.se3 import exp, inv, mul
 from droidw.interfaces.correspondence import EdgeUpdate
+from droidw.interfaces.uncertainty import UncertaintyReport
 from droidw.slam import backwards as module
 from droidw.slam.backwards import WayBack, doubted, track_backwards
 from droidw.slam.diagnosis import Diagnosis
@@ -28,6 +29,21 @@ GRID, INTRINSICS = Grid(H, W, 8, 3.5), torch.tensor([82.0, 82.0, 47.5, 31.5])
 def relative(T_cw):
     """Every pose seen from the first one, [N,7]."""
     return mul(T_cw, inv(T_cw[:1]).expand_as(T_cw))
+
+
+class Learned:
+    """An uncertainty model that knows little of a new keyframe and learns a tenth at a time."""
+
+    def __init__(self):
+        self.appended = []
+
+    def append(self, view, index):
+        self.appended.append(index)
+        view.uncertainty[index] = 5.0
+
+    def update(self, view):
+        view.uncertainty[view.frames] += 0.1
+        return UncertaintyReport()
 
 
 @pytest.fixture
@@ -49,9 +65,8 @@ def optimiser(truth, stored):
         return EdgeUpdate(target, valid[..., None].float().expand_as(target).contiguous())
 
     session = SimpleNamespace(update=measured, forget=lambda ids: None)
-    parts = Parts(
-        None, None, None, TorchBundleAdjuster(), SimpleNamespace(session=lambda _: session)
-    )
+    operator = SimpleNamespace(session=lambda _: session)
+    parts = Parts(None, None, Learned(), TorchBundleAdjuster(), operator)
     off = exp(torch.tensor([0.1, -0.05, 0.0, 0.05, 0.1, 0.05])).expand(COUNT - WARM, -1)
     astray = torch.cat([mul(off, T_cw[: COUNT - WARM]), T_cw[COUNT - WARM :]])
     store = stored(GRID, INTRINSICS.clone(), astray, disps)
@@ -97,6 +112,23 @@ def test_the_first_pose_of_the_run_and_all_else_stay(optimiser):
     assert torch.allclose(store.T_cw[0], first, atol=1e-6)
     assert store.times() == times
     assert [info.index for info in store.infos] == list(range(COUNT))
+
+
+def test_uncertainty_goes_on_from_what_it_has_learned(optimiser, config):
+    store = optimiser.store
+    known = 0.01 * torch.arange(1.0, 1 + COUNT)[:, None, None].expand(COUNT, H, W)
+    store["uncertainty"].copy_(known)
+    # So much that a gate closes does not matter here: the weights are the same everywhere.
+    config.schedule = {name: replace(row, weigh=False) for name, row in config.schedule.items()}
+    back, _ = track(optimiser, config)
+    assert optimiser.parts.uncertainty.appended == list(range(COUNT))
+    assert torch.equal(store["uncertainty"], known)
+    learned = back.store["uncertainty"].flip(0) - known
+    assert learned.min() > 0.05
+    steps = (learned / 0.1).round()
+    assert torch.allclose(learned, 0.1 * steps, atol=1e-4)
+    back.write_to(store)
+    assert torch.equal(store["uncertainty"], back.store["uncertainty"].flip(0))
 
 
 def test_learned_damping_and_full_maps_come_along(optimiser):

@@ -1,0 +1,72 @@
+"""Runs whose keyframes are tracked from the last to the first as well."""
+
+from __future__ import annotations
+
+import pytest
+
+from droidw.slam import backwards as module
+from droidw.slam.backend import Backend
+from droidw.slam.backwards import WayBack
+
+DOUBT = ("backend.backwards_below=1", "features=cnn", "uncertainty=affine-softplus", "threads=1")
+FILES = ("trajectory.tum", "keyframes.tum", "points.ply")
+
+
+@pytest.fixture
+def believed(monkeypatch):
+    """Every way back agrees best."""
+    real = module.track_backwards
+
+    def tracked(*arguments):
+        return WayBack(real(*arguments).store, 1.0)
+
+    monkeypatch.setattr(module, "track_backwards", tracked)
+
+
+def test_a_run_may_have_the_way_back(go, footage, believed):
+    ran = go(footage().folder, *DOUBT, "exporters.depth={}")
+    assert ran.code == 0, ran.err
+    assert ran.manifest["backwards"] is True
+    assert ran.manifest["agreement"] == 1.0
+    assert ran.manifest["stages"]["backwards"] > 0
+    assert len(ran.poses) == 26
+    # The first camera is where the world begins, whichever way it was tracked.
+    assert ran.poses[0, 1:] == pytest.approx([0, 0, 0, 0, 0, 0, 1], abs=1e-5)
+
+
+def test_twice_gives_the_same_bytes(go, footage, believed):
+    one, two = (go(footage(name=name).folder, *DOUBT, to=f"to-{name}") for name in "ab")
+    assert one.manifest["backwards"] and two.manifest["backwards"]
+    for name in FILES:
+        assert (one.folder / name).read_bytes() == (two.folder / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("how", ["fails", "agrees less", "is stopped"])
+def test_the_way_there_is_what_it_would_have_been(go, footage, monkeypatch, how):
+    plain = go(footage(name="a").folder, *DOUBT, "backend.backwards_below=0", to="to-a")
+    assert plain.manifest["backwards"] is False
+    assert "backwards" not in plain.manifest["stages"]
+    run, real, calls = Backend.run, module.track_backwards, []
+
+    def second(self, tell):
+        calls.append(self)
+        if len(calls) == 2:
+            raise RuntimeError("no more")
+        return run(self, tell)
+
+    def tracked(optimiser, config, tell, stopped):
+        if how == "is stopped":
+            return real(optimiser, config, tell, lambda: True)
+        back = real(optimiser, config, tell, stopped)
+        return WayBack(back.store, 0.0)
+
+    if how == "fails":
+        monkeypatch.setattr(Backend, "run", second)
+    else:
+        monkeypatch.setattr(module, "track_backwards", tracked)
+    ran = go(footage(name="b").folder, *DOUBT, to="to-b")
+    assert ran.code == 0, ran.err
+    assert ran.manifest["backwards"] is False
+    assert ("no more" in ran.warnings) == (how == "fails")
+    for name in FILES:
+        assert (ran.folder / name).read_bytes() == (plain.folder / name).read_bytes(), name
