@@ -22,7 +22,7 @@ from droidw.slam.optimise import Optimiser
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from droidw.config.schema import DroidwConfig
+    from droidw.config.schema import DroidwConfig, PhaseConfig
     from droidw.slam.diagnosis import Diagnosis
 
 __all__ = ["WayBack", "doubted", "track_backwards"]
@@ -108,8 +108,8 @@ def track_backwards(
 ) -> WayBack | None:
     """Track the keyframes of a run from the last one to the first, and adjust them globally.
 
-    It sets off from the last poses and depths of the run. No keyframe is dropped, and uncertainty
-    goes on learning from what it knows.
+    It sets off from the last poses and depths of the run. No keyframe is dropped. Uncertainty stays
+    as it has learned to be on the way, and learns once more in global adjustment.
 
     Args:
         optimiser: of the run, whose store is left as it is.
@@ -122,7 +122,9 @@ def track_backwards(
     count, first = len(known), config.frontend.warmup
     if count <= first:
         return None
-    config = replace(config, camera=replace(config.camera, refine_focal=False))
+    config = replace(
+        config, schedule=_schedule(config), camera=replace(config.camera, refine_focal=False)
+    )
     store = known.blank()
     beside = optimiser.beside(store)
     frontend = Frontend(beside, config)
@@ -153,6 +155,19 @@ def track_backwards(
         return None
     optimiser.add_reports(beside)
     return WayBack(store, backend.agreement)
+
+
+def _schedule(config: DroidwConfig) -> dict[str, PhaseConfig]:
+    """That of the run, but that uncertainty learns in global adjustment alone, if at all.
+
+    What a path that went astray has taught it is put right there; while keyframes are tracked,
+    masks that change cost more than they bring.
+    """
+    learns = any(row.learn for row in config.schedule.values())
+    return {
+        name: replace(row, learn=learns and name == "global")
+        for name, row in config.schedule.items()
+    }
 
 
 def _append(optimiser: Optimiser, info: KeyframeInfo, values: dict[str, Tensor]) -> None:
