@@ -14,15 +14,13 @@ from typing import TYPE_CHECKING
 
 from droidw.events import Dispatcher, Progress
 from droidw.geometry.se3 import inv, mul
-from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.graph.store import KeyframeStore
 from droidw.slam.backend import Backend
 from droidw.slam.frontend import Frontend
 from droidw.slam.optimise import Optimiser
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
-    from droidw.config.schema import DroidwConfig, PhaseConfig
+    from droidw.config.schema import DroidwConfig
     from droidw.slam.diagnosis import Diagnosis
 
 __all__ = ["WayBack", "doubted", "track_backwards"]
@@ -35,7 +33,7 @@ class WayBack:
     """The keyframes of a run, last first, tracked in that order.
 
     Attributes:
-        store: poses, depths and uncertainty are new, the rest is that of the run.
+        store: poses and depths are new, the rest is that of the run.
         agreement: as of `Backend`.
     """
 
@@ -43,11 +41,10 @@ class WayBack:
     agreement: float
 
     def write_to(self, store: KeyframeStore) -> None:
-        """Let the run have all of this; its first pose stays what it was."""
+        """Let the run have these poses and depths; its first pose stays what it was."""
         T_cw, first = self.store.T_cw.flip(0), store.T_cw[:1].clone()
         store.write(mul(mul(T_cw, inv(T_cw[:1])), first), self.store.disps.flip(0))
-        for name in ("damping", "uncertainty", *store.extra()):
-            store[name].copy_(self.store[name].flip(0))
+        store["damping"].copy_(self.store["damping"].flip(0))
         for info, other in zip(store.infos, reversed(self.store.infos), strict=True):
             info.disp_full = other.disp_full
 
@@ -109,7 +106,7 @@ def track_backwards(
     """Track the keyframes of a run from the last one to the first, and adjust them globally.
 
     It sets off from the last poses and depths of the run. No keyframe is dropped. Uncertainty stays
-    as it has learned to be on the way, and learns once more in global adjustment.
+    as it has learned to be, so that what agrees there and back is weighed alike.
 
     Args:
         optimiser: of the run, whose store is left as it is.
@@ -122,12 +119,11 @@ def track_backwards(
     count, first = len(known), config.frontend.warmup
     if count <= first:
         return None
-    config = replace(
-        config, schedule=_schedule(config), camera=replace(config.camera, refine_focal=False)
-    )
+    schedule = {name: replace(row, learn=False) for name, row in config.schedule.items()}
+    camera = replace(config.camera, refine_focal=False)
+    config = replace(config, schedule=schedule, camera=camera)
     store = known.blank()
-    beside = optimiser.beside(store)
-    frontend = Frontend(beside, config)
+    frontend = Frontend(optimiser.beside(store), config)
     steps = sum(config.backend.passes)
 
     def told(done: int) -> None:
@@ -143,42 +139,18 @@ def track_backwards(
             values = known.values(node)
             if done >= first:
                 values["T_cw"], values["disps"] = frontend.guess(info.time)
-            _append(beside, info, values)
+            store.append(info, **values)
             if done == first - 1:
                 frontend.resume()
             elif done >= first:
                 frontend.grow(forced=True)
         frontend.release()
-        backend = Backend(beside, config)
+        backend = Backend(frontend.optimiser, config)
         backend.run(lambda done, total: told(count + done))
     except _Stopped:
         return None
-    optimiser.add_reports(beside)
+    optimiser.add_reports(frontend.optimiser)
     return WayBack(store, backend.agreement)
-
-
-def _schedule(config: DroidwConfig) -> dict[str, PhaseConfig]:
-    """That of the run, but that uncertainty learns in global adjustment alone, if at all.
-
-    What a path that went astray has taught it is put right there; while keyframes are tracked,
-    masks that change cost more than they bring.
-    """
-    learns = any(row.learn for row in config.schedule.values())
-    return {
-        name: replace(row, learn=learns and name == "global")
-        for name, row in config.schedule.items()
-    }
-
-
-def _append(optimiser: Optimiser, info: KeyframeInfo, values: dict[str, Tensor]) -> None:
-    """Append a keyframe with all that is known of it."""
-    store, uncertainty = optimiser.store, optimiser.parts.uncertainty
-    number = store.append(info, **values)
-    # It is told that the number means another keyframe now, and what it makes of that is less
-    # than what it has learned.
-    uncertainty.append(optimiser.view(), number)
-    for name in ("uncertainty", *store.extra()):
-        store[name][number] = values[name]
 
 
 class _Stopped(Exception):

@@ -14,7 +14,6 @@ from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
 from droidw.geometry.se3 import exp, inv, mul
 from droidw.interfaces.correspondence import EdgeUpdate
-from droidw.interfaces.uncertainty import UncertaintyReport
 from droidw.slam import backwards as module
 from droidw.slam.backwards import WayBack, doubted, track_backwards
 from droidw.slam.diagnosis import Diagnosis
@@ -29,21 +28,6 @@ GRID, INTRINSICS = Grid(H, W, 8, 3.5), torch.tensor([82.0, 82.0, 47.5, 31.5])
 def relative(T_cw):
     """Every pose seen from the first one, [N,7]."""
     return mul(T_cw, inv(T_cw[:1]).expand_as(T_cw))
-
-
-class Learned:
-    """An uncertainty model that knows little of a new keyframe and learns a tenth at a time."""
-
-    def __init__(self):
-        self.appended = []
-
-    def append(self, view, index):
-        self.appended.append(index)
-        view.uncertainty[index] = 5.0
-
-    def update(self, view):
-        view.uncertainty[view.frames] += 0.1
-        return UncertaintyReport()
 
 
 @pytest.fixture
@@ -66,7 +50,7 @@ def optimiser(truth, stored):
 
     session = SimpleNamespace(update=measured, forget=lambda ids: None)
     operator = SimpleNamespace(session=lambda _: session)
-    parts = Parts(None, None, Learned(), TorchBundleAdjuster(), operator)
+    parts = Parts(None, None, None, TorchBundleAdjuster(), operator)
     off = exp(torch.tensor([0.1, -0.05, 0.0, 0.05, 0.1, 0.05])).expand(COUNT - WARM, -1)
     astray = torch.cat([mul(off, T_cw[: COUNT - WARM]), T_cw[COUNT - WARM :]])
     store = stored(GRID, INTRINSICS.clone(), astray, disps)
@@ -114,22 +98,14 @@ def test_the_first_pose_of_the_run_and_all_else_stay(optimiser):
     assert [info.index for info in store.infos] == list(range(COUNT))
 
 
-@pytest.mark.parametrize("learns", [True, False])
-def test_uncertainty_learns_at_the_end_if_at_all(optimiser, config, learns):
+def test_uncertainty_stays_as_it_has_learned_to_be(optimiser, config):
     store = optimiser.store
     known = 0.01 * torch.arange(1.0, 1 + COUNT)[:, None, None].expand(COUNT, H, W)
     store["uncertainty"].copy_(known)
-    rows = config.schedule.items()
-    config.schedule = {name: replace(row, learn=learns and row.learn) for name, row in rows}
     back, _ = track(optimiser, config)
-    assert optimiser.parts.uncertainty.appended == list(range(COUNT))
-    assert torch.equal(store["uncertainty"], known)
-    # A tenth with every iteration of the two global updates, to all keyframes alike.
-    learned = back.store["uncertainty"].flip(0) - known
-    steps = 2 * config.schedule["global"].iterations if learns else 0
-    assert torch.allclose(learned, torch.full_like(learned, 0.1 * steps), atol=1e-4)
+    assert torch.equal(back.store["uncertainty"].flip(0), known)
     back.write_to(store)
-    assert torch.equal(store["uncertainty"], back.store["uncertainty"].flip(0))
+    assert torch.equal(store["uncertainty"], known)
 
 
 def test_learned_damping_and_full_maps_come_along(optimiser):
