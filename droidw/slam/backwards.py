@@ -16,6 +16,7 @@ from droidw.events import Dispatcher, Progress
 from droidw.geometry.se3 import inv, mul
 from droidw.graph.store import KeyframeStore
 from droidw.slam.backend import Backend
+from droidw.slam.doubt import doubtful
 from droidw.slam.frontend import Frontend
 from droidw.slam.optimise import Optimiser
 
@@ -67,9 +68,8 @@ def doubted(
     Returns:
         What to say of what is kept.
     """
-    below, agreement = config.backend.backwards_below, found.agreement
-    # NaN, where nothing was adjusted, is no reason.
-    if not (agreement < below or below == agreement == 1.0):
+    agreement = found.agreement
+    if not doubtful(agreement, config.backend.backwards_below):
         return found
     _log.info(
         "%.0f %% of what was measured agrees with poses and depths: tracking the keyframes "

@@ -14,10 +14,21 @@ if TYPE_CHECKING:
     from droidw.graph.factors import FactorGraph
     from droidw.graph.store import KeyframeStore
 
-__all__ = ["explained_share"]
+__all__ = ["doubtful", "explained_share"]
 
 # Distance of measured and predicted place, in cells, at which they agree by half.
 _SCALE = 0.2
+
+
+def doubtful(agreement: float, below: float) -> bool:
+    """Whether so little agrees that a run should look again.
+
+    Args:
+        agreement: what `explained_share` said in the end. NaN, where nothing was adjusted, is no
+            reason.
+        below: agreement below which there is doubt; 1 doubts all.
+    """
+    return agreement < below or below == agreement == 1.0
 
 
 def explained_share(
