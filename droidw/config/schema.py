@@ -204,6 +204,11 @@ class BackendConfig:
         ge=0,
         le=1,
     )
+    splice: bool = opt(
+        True,
+        "of the way that agrees less there and back, take the pieces in which more agrees",
+    )
+    relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
 
 
 @dataclass

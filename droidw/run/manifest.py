@@ -122,7 +122,7 @@ def facts_of_tracking(source: FrameSource, outcome: Outcome) -> dict[str, Any]:
         "last_frame": outcome.last_index,
         "keyframes": len(outcome.keyframes),
         "agreement": None if math.isnan(agreement) else round(agreement, 4),
-        "backwards": outcome.diagnosis.backwards,
+        "backwards": round(outcome.diagnosis.backwards, 4),
         "skipped": source.skipped,
         "problems": source.problems[:100],
         "intrinsics": {

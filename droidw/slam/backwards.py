@@ -9,45 +9,29 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
+import torch
+
 from droidw.events import Dispatcher, Progress
-from droidw.geometry.se3 import inv, mul
-from droidw.graph.store import KeyframeStore
 from droidw.slam.backend import Backend
 from droidw.slam.doubt import doubtful
 from droidw.slam.frontend import Frontend
 from droidw.slam.optimise import Optimiser
+from droidw.slam.path import Path
+from droidw.slam.splice import lead, pieces, spliced, support
 
 if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig
     from droidw.slam.diagnosis import Diagnosis
 
-__all__ = ["WayBack", "doubted", "track_backwards"]
+__all__ = ["doubted", "track_backwards"]
 
 _log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class WayBack:
-    """The keyframes of a run, last first, tracked in that order.
-
-    Attributes:
-        store: poses and depths are new, the rest is that of the run.
-        agreement: as of `Backend`.
-    """
-
-    store: KeyframeStore
-    agreement: float
-
-    def write_to(self, store: KeyframeStore) -> None:
-        """Let the run have these poses and depths; its first pose stays what it was."""
-        T_cw, first = self.store.T_cw.flip(0), store.T_cw[:1].clone()
-        store.write(mul(mul(T_cw, inv(T_cw[:1])), first), self.store.disps.flip(0))
-        store["damping"].copy_(self.store["damping"].flip(0))
-        for info, other in zip(store.infos, reversed(self.store.infos), strict=True):
-            info.disp_full = other.disp_full
+Tell = Callable[[int, int], None]
 
 
 def doubted(
@@ -57,12 +41,13 @@ def doubted(
     events: Dispatcher,
     stopped: Callable[[], bool],
 ) -> Diagnosis:
-    """Where too little of what a run measured agrees, let it have what the way back finds.
+    """Where too little of what a run measured agrees, let it have what the way back finds better.
 
-    That is kept only if more of what it measures agrees. What was found stays if it fails, too.
+    All of it if more of what it measures agrees, then pieces of the way that agrees less in which
+    it agrees more; with what is kept uncertainty learns once more. What fails is left out.
 
     Args:
-        optimiser: of the run; poses and depths of its store may change.
+        optimiser: of the run; poses, depths and uncertainty of its store may change.
         found: of the run so far.
         stopped: whether the run is to end soon.
     Returns:
@@ -76,33 +61,112 @@ def doubted(
         "backwards (backend.backwards_below=0 does not)",
         100 * agreement,
     )
-
-    def tell(done: int, total: int) -> None:
-        events.emit(Progress("backwards", done, total))
-
+    look = _SecondLook(optimiser, config, agreement, events, stopped)
     try:
         with optimiser.clock("backwards"):
-            back = track_backwards(optimiser, config, tell, stopped)
+            look.run()
+    except _Stopped:
+        pass
     except Exception as error:  # noqa: BLE001 - what was found forwards is as good as it was
         why = str(error) or type(error).__name__
         events.warn(f"the keyframes could not be tracked backwards, what was found is kept: {why}")
-        return found
-    if back is None:
-        return found
-    kept = back.agreement > agreement
-    _log.info("%.0f %% agrees backwards%s", 100 * back.agreement, ", kept" if kept else "")
-    if kept:
-        back.write_to(optimiser.store)
-        found = replace(found, agreement=back.agreement, backwards=True)
-    return found
+    look.kept.write_to(optimiser.store)
+    return replace(found, agreement=look.kept.agreement, backwards=look.share)
+
+
+class _SecondLook:
+    """What is made of the way back.
+
+    Attributes:
+        kept: the best path so far.
+        share: of its intervals between keyframes, those from the way back.
+    """
+
+    def __init__(
+        self,
+        optimiser: Optimiser,
+        config: DroidwConfig,
+        agreement: float,
+        events: Dispatcher,
+        stopped: Callable[[], bool],
+    ) -> None:
+        self.optimiser = optimiser
+        # The focal length is as good as it gets from a path that is in doubt.
+        self.config = replace(config, camera=replace(config.camera, refine_focal=False))
+        self.kept = Path.of(optimiser.store, agreement)
+        self.share = 0.0
+        self._events = events
+        self._stopped = stopped
+        self._done = 0
+        steps, options = sum(config.backend.passes), config.backend
+        rounds = 1 + int(options.splice) + int(options.relearn)
+        self._total = len(optimiser.store) + rounds * steps
+
+    def run(self) -> None:
+        """All of it, with `kept` up to date whenever it is left."""
+        options, there = self.config.backend, self.kept
+        back = track_backwards(self.optimiser, self.config, self._tell, self._stopped)
+        if back is None:
+            return
+        better = back.agreement > there.agreement
+        _log.info("%.0f %% agrees backwards%s", 100 * back.agreement, ", kept" if better else "")
+        if better:
+            self.kept, self.share = back, 1.0
+        changed = better
+        if options.splice:
+            changed |= self._splice(there if better else back)
+        if options.relearn and changed:
+            self._relearn()
+        self._events.emit(Progress("backwards", self._total, self._total))
+
+    def _splice(self, other: Path) -> bool:
+        """Take the pieces of another path in which it agrees more; whether there are any."""
+        optimiser, mine = self.optimiser, self.share
+        known = support(optimiser, self.kept)
+        taken = pieces(lead(support(optimiser, other), known))
+        if not any(taken):
+            return False
+        found = self._adjusted(spliced(self.kept, other, taken, optimiser.gates()), learn=False)
+        # Global adjustment may have left what was taken for it.
+        gained = lead(support(optimiser, found), known)[torch.tensor(taken)].sum()
+        holds = float(gained) > 0
+        number = sum(now and not before for before, now in pairwise([False, *taken]))
+        outcome = "kept" if holds else "but do not hold"
+        _log.info("%d pieces of the other way agree more, %s", number, outcome)
+        if holds:
+            part = sum(taken) / len(taken)
+            self.kept, self.share = found, mine + part * (1.0 - 2.0 * mine)
+        return holds
+
+    def _relearn(self) -> None:
+        """Let uncertainty learn from the path that is kept, and the path adjust to that."""
+        # What agrees with new weights is nothing to compare with what agreed before.
+        agreement = self.kept.agreement
+        self.kept = replace(self._adjusted(self.kept, learn=True), agreement=agreement)
+
+    def _adjusted(self, path: Path, learn: bool) -> Path:
+        """A path after global adjustment."""
+        path.write_to(self.optimiser.store)
+        before = self._done
+        row = replace(self.config.schedule["global"], learn=learn)
+        config = replace(self.config, schedule={**self.config.schedule, "global": row})
+        backend = Backend(self.optimiser, config)
+        backend.run(lambda done, _: self._tell(before + done, self._total))
+        return Path.of(self.optimiser.store, backend.agreement)
+
+    def _tell(self, done: int, total: int) -> None:
+        if self._stopped():
+            raise _Stopped
+        self._done = done
+        self._events.emit(Progress("backwards", done, self._total))
 
 
 def track_backwards(
     optimiser: Optimiser,
     config: DroidwConfig,
-    tell: Callable[[int, int], None],
+    tell: Tell,
     stopped: Callable[[], bool],
-) -> WayBack | None:
+) -> Path | None:
     """Track the keyframes of a run from the last one to the first, and adjust them globally.
 
     It sets off from the last poses and depths of the run. No keyframe is dropped. Uncertainty stays
@@ -113,7 +177,8 @@ def track_backwards(
         tell: called with (keyframes and update steps done, those in all).
         stopped: asked before each of these; whether to give up.
     Returns:
-        None if there is nothing to track, or it was given up.
+        What was found, in the order of the run and with its first pose; None if there is nothing to
+        track, or it was given up.
     """
     known = optimiser.store
     count, first = len(known), config.frontend.warmup
@@ -150,7 +215,7 @@ def track_backwards(
     except _Stopped:
         return None
     optimiser.add_reports(frontend.optimiser)
-    return WayBack(store, backend.agreement)
+    return Path.of(store, backend.agreement).turned(known.T_cw[0])
 
 
 class _Stopped(Exception):

@@ -28,7 +28,8 @@ class Diagnosis:
         points: points of the static cloud, None if unknown.
         agreement: share of what global adjustment measured that agrees with poses and depths, see
             `explained_share`; NaN if unknown.
-        backwards: poses and depths of keyframes are from the last one to the first.
+        backwards: share of the path between keyframes that was tracked from the last one to the
+            first.
     """
 
     frames: int
@@ -39,7 +40,7 @@ class Diagnosis:
     parallax: float = float("nan")
     points: int | None = None
     agreement: float = float("nan")
-    backwards: bool = False
+    backwards: float = 0.0
 
     def warnings(self) -> list[str]:
         """Sentences for the log and the report."""

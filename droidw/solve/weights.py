@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 __all__ = [
     "GateKind",
     "agreeing_share",
+    "agreeing_weight",
     "gate",
     "residual_weights",
     "unmasked",
@@ -123,11 +124,24 @@ def agreeing_share(residual: Tensor, weight: Tensor, scale: float, nothing: floa
     Returns:
         A scalar on the device.
     """
-    known = torch.isfinite(residual) & torch.isfinite(weight)
-    weight = torch.where(known, weight, 0.0)
-    apart = torch.where(known, residual, 0.0)
-    agreeing, total = (weight / (1.0 + (apart / scale).square_())).sum(), weight.sum()
+    agreeing = agreeing_weight(residual, weight, scale).sum()
+    total = torch.where(_known(residual, weight), weight, 0.0).sum()
     return torch.where(total > 0, agreeing / total.clamp_min(1e-6), nothing)
+
+
+def agreeing_weight(residual: Tensor, weight: Tensor, scale: float) -> Tensor:
+    """What `1 / (1 + (r / scale)^2)` leaves of each weight; 0 where nothing was measured.
+
+    Args:
+        residual, weight, scale: as of `agreeing_share`.
+    """
+    known = _known(residual, weight)
+    apart = torch.where(known, residual, 0.0)
+    return torch.where(known, weight, 0.0) / (1.0 + (apart / scale).square_())
+
+
+def _known(residual: Tensor, weight: Tensor) -> Tensor:
+    return torch.isfinite(residual) & torch.isfinite(weight)
 
 
 def _gate_at(gates: Tensor, target: Tensor) -> Tensor:

@@ -183,6 +183,20 @@ def test_the_page_says_how_much_agrees_and_that_it_was_tracked_twice(
     assert "of matches agree" not in said[2]
 
 
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(0.0, ""), (0.691, "69% of it backwards"), (1.0, "backwards in the end"), ("all", "")],
+)
+def test_the_page_says_how_much_was_tracked_backwards(
+    make_result: Make, tmp_path: Path, share: object, words: str
+) -> None:
+    facts = {"agreement": 0.7, "backwards": share}
+    result = make_result(tmp_path, frames=5, keyframes=1, manifest=facts)
+    text = checked(build_page(result, tmp_path, {})).text
+    assert words in text
+    assert ("backwards" in text) == bool(words)
+
+
 def test_a_strange_manifest_is_left_out(make_result: Make, tmp_path: Path) -> None:
     manifest = {
         "stages": {"track": float("nan"), "fill": "long", "global": -1}, "fps": float("inf"),

@@ -15,9 +15,10 @@ from droidw.geometry.projective import reproject
 from droidw.geometry.se3 import exp, inv, mul
 from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.slam import backwards as module
-from droidw.slam.backwards import WayBack, doubted, track_backwards
+from droidw.slam.backwards import doubted, track_backwards
 from droidw.slam.diagnosis import Diagnosis
 from droidw.slam.optimise import Optimiser, Parts
+from droidw.slam.path import Path
 from droidw.slam.timing import Stopwatch
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 
@@ -78,7 +79,7 @@ def test_the_way_back_finds_what_the_way_there_lost(optimiser, config, truth):
     before = optimiser.store.T_cw.clone()
     back, told = track(optimiser, config)
     assert torch.equal(optimiser.store.T_cw, before)
-    assert [info.index for info in back.store.infos] == list(range(COUNT))[::-1]
+    assert torch.allclose(back.T_cw[0], before[0], atol=1e-6)
     assert back.agreement > 0.99
     back.write_to(optimiser.store)
     found, right = relative(optimiser.store.T_cw), relative(truth[0])
@@ -89,33 +90,17 @@ def test_the_way_back_finds_what_the_way_there_lost(optimiser, config, truth):
     assert told == [(k, COUNT + 2) for k in range(COUNT)] + [(COUNT + k, COUNT + 2) for k in (1, 2)]
 
 
-def test_the_first_pose_of_the_run_and_all_else_stay(optimiser):
-    store = optimiser.store
-    first, times = store.T_cw[0].clone(), store.times()
-    WayBack(turned(store), 1.0).write_to(store)
-    assert torch.allclose(store.T_cw[0], first, atol=1e-6)
-    assert store.times() == times
-    assert [info.index for info in store.infos] == list(range(COUNT))
-
-
-def test_uncertainty_stays_as_it_has_learned_to_be(optimiser, config):
+def test_all_but_the_path_stays(optimiser, config):
     store = optimiser.store
     known = 0.01 * torch.arange(1.0, 1 + COUNT)[:, None, None].expand(COUNT, H, W)
     store["uncertainty"].copy_(known)
+    first, times = store.T_cw[0].clone(), store.times()
     back, _ = track(optimiser, config)
-    assert torch.equal(back.store["uncertainty"].flip(0), known)
     back.write_to(store)
+    assert torch.allclose(store.T_cw[0], first, atol=1e-6)
+    assert store.times() == times
+    assert [info.index for info in store.infos] == list(range(COUNT))
     assert torch.equal(store["uncertainty"], known)
-
-
-def test_learned_damping_and_full_maps_come_along(optimiser):
-    back = WayBack(turned(optimiser.store), 1.0)
-    back.store["damping"].copy_(torch.arange(COUNT)[:, None, None].expand(COUNT, H, W).float())
-    for k, info in enumerate(back.store.infos):
-        info.disp_full = k
-    back.write_to(optimiser.store)
-    assert optimiser.store["damping"][:, 0, 0].tolist() == list(range(COUNT))[::-1]
-    assert [info.disp_full for info in optimiser.store.infos] == list(range(COUNT))[::-1]
 
 
 @pytest.mark.parametrize("after", [0, WARM - 1, COUNT - 1, COUNT, COUNT + 1])
@@ -141,50 +126,112 @@ class Heard:
         self.events.append(event)
 
 
-def turned(store):
-    """The keyframes last first, with a bend in their path."""
-    other = store.blank()
-    for k in reversed(range(len(store))):
-        bend = exp(torch.tensor([0.0, 0.1, 0.0, 0.0, 0.0, 0.01]) * k)
-        other.append(
-            replace(store.infos[k]), **store.values(k) | {"T_cw": mul(bend, store.T_cw[k])}
-        )
-    return other
+def bent(store, agreement, mark=1.0):
+    """Another path of the keyframes; `mark` of it is in its depths."""
+    k = torch.arange(float(len(store)))[:, None]
+    bend = exp(k * torch.tensor([0.0, 0.1, 0.0, 0.0, 0.0, 0.01]))
+    made = Path.of(store, agreement)
+    return replace(made, T_cw=mul(bend, store.T_cw), disps=torch.full_like(made.disps, mark))
 
 
-def settle(optimiser, config, monkeypatch, found, agreement=0.5):
-    """What `doubted` makes of a way back that `found` does, and the dispatcher."""
-    made = turned(optimiser.store)
-    asked = []
+class Settled:
+    """What `doubted` makes of a way back.
 
-    def tracked(*arguments):
-        asked.append(arguments)
-        if isinstance(found, Exception):
-            raise found
-        return None if found is None else WayBack(made, found)
+    Args:
+        found: agreement of the way back; None if it was given up, or what it fails with.
+        piece: intervals of the other way that agree more, and whether they hold.
+        adjusted: agreement after each further global adjustment, or what it fails with.
+    Attributes:
+        learned: for each further global adjustment, whether uncertainty was to learn.
+    """
 
-    monkeypatch.setattr(module, "track_backwards", tracked)
-    events = Dispatcher()
-    diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=agreement)
-    kept = doubted(optimiser, config, diagnosis, events, lambda: False)
-    return kept, events, len(asked)
+    def __init__(self, optimiser, config, monkeypatch, found, agreement=0.5, **more):
+        self.asked, self.learned, self.compared = 0, [], 0
+        self.more = {"piece": (), "holds": True, "adjusted": 0.7} | more
+        self.found = bent(optimiser.store, found) if isinstance(found, float) else found
+        monkeypatch.setattr(module, "track_backwards", self.track)
+        monkeypatch.setattr(module, "support", self.support)
+        monkeypatch.setattr(module.Backend, "run", lambda backend, tell: self.adjust(backend, tell))
+        self.events = Dispatcher()
+        diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=agreement)
+        self.kept = doubted(optimiser, config, diagnosis, self.events, lambda: False)
+
+    def track(self, *arguments):
+        self.asked += 1
+        if isinstance(self.found, Exception):
+            raise self.found
+        return self.found
+
+    def support(self, optimiser, path):
+        """Asked of the path that is kept, of the other one, and of what was made of both."""
+        self.compared += 1
+        between = torch.ones(COUNT - 1, dtype=torch.float64)
+        if self.compared > 1:
+            better = self.compared == 2 or self.more["holds"]
+            between[list(self.more["piece"])] *= 3.0 if better else 0.5
+        return between
+
+    def adjust(self, backend, tell):
+        self.learned.append(backend.config.schedule["global"].learn)
+        if isinstance(self.more["adjusted"], Exception):
+            raise self.more["adjusted"]
+        for done in (1, 2):
+            tell(done, 2)
+        backend.agreement = self.more["adjusted"]
 
 
 @pytest.mark.parametrize("found", [0.5, 0.4, float("nan"), None, RuntimeError("no memory")])
 def test_what_was_found_first_stays_unless_more_agrees(optimiser, config, monkeypatch, found):
     before = optimiser.store.T_cw.clone()
-    kept, events, asked = settle(optimiser, config, monkeypatch, found)
-    assert asked == 1
-    assert (kept.agreement, kept.backwards) == (0.5, False)
+    made = Settled(optimiser, config, monkeypatch, found)
+    assert made.asked == 1
+    assert (made.kept.agreement, made.kept.backwards) == (0.5, 0.0)
     assert torch.equal(optimiser.store.T_cw, before)
-    assert any("no memory" in text for text in events.warnings) == isinstance(found, Exception)
+    assert any("no memory" in text for text in made.events.warnings) == isinstance(found, Exception)
+    # Nothing has changed that could be learned from.
+    assert made.learned == []
 
 
-def test_the_way_back_is_kept_where_more_agrees(optimiser, config, monkeypatch):
+def test_the_way_back_is_kept_where_more_agrees_and_learned_from(optimiser, config, monkeypatch):
+    other = bent(optimiser.store, 0.6)
+    made = Settled(optimiser, config, monkeypatch, 0.6)
+    assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
+    assert torch.equal(optimiser.store.T_cw, other.T_cw)
+    assert made.learned == [True]
+
+
+@pytest.mark.parametrize(("found", "share"), [(0.6, 1 - 4 / 13), (0.4, 4 / 13)])
+def test_pieces_of_the_way_that_agrees_less_are_taken(optimiser, config, monkeypatch, found, share):
+    optimiser.store.disps.fill_(1.0)
+    made = Settled(optimiser, config, monkeypatch, found, piece=range(3, 7))
+    assert (made.kept.agreement, made.kept.backwards) == (0.7, pytest.approx(share))
+    assert made.learned == [False, True]
+
+
+def test_pieces_that_global_adjustment_leaves_are_not_kept(optimiser, config, monkeypatch):
     before = optimiser.store.T_cw.clone()
-    kept, _, _ = settle(optimiser, config, monkeypatch, 0.6)
-    assert (kept.agreement, kept.backwards) == (0.6, True)
-    assert not torch.allclose(optimiser.store.T_cw, before, atol=1e-3)
+    made = Settled(optimiser, config, monkeypatch, 0.4, piece=range(3, 7), holds=False)
+    assert (made.kept.agreement, made.kept.backwards) == (0.5, 0.0)
+    assert torch.equal(optimiser.store.T_cw, before)
+    assert made.learned == [False]
+
+
+def test_no_pieces_and_no_learning_if_not_asked_for(optimiser, config, monkeypatch):
+    config.backend.splice = config.backend.relearn = False
+    made = Settled(optimiser, config, monkeypatch, 0.6, piece=range(3, 7))
+    assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
+    assert made.learned == []
+    assert made.compared == 0
+
+
+@pytest.mark.parametrize("piece", [(), range(3, 7)])
+def test_what_fails_after_the_way_back_leaves_it(optimiser, config, monkeypatch, piece):
+    other = bent(optimiser.store, 0.6)
+    failure = RuntimeError("no memory")
+    made = Settled(optimiser, config, monkeypatch, 0.6, piece=piece, adjusted=failure)
+    assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
+    assert torch.equal(optimiser.store.T_cw, other.T_cw)
+    assert any("no memory" in text for text in made.events.warnings)
 
 
 @pytest.mark.parametrize(
@@ -193,11 +240,17 @@ def test_the_way_back_is_kept_where_more_agrees(optimiser, config, monkeypatch):
 )
 def test_only_doubt_asks_for_it(optimiser, config, monkeypatch, below, agreement, asked):
     config.backend.backwards_below = below
-    assert settle(optimiser, config, monkeypatch, None, agreement)[2] == asked
+    assert Settled(optimiser, config, monkeypatch, None, agreement).asked == asked
 
 
-def test_it_is_told_how_far_it_is(optimiser, config):
+@pytest.mark.parametrize("splice", [True, False])
+def test_it_is_told_how_far_it_is(optimiser, config, splice):
     heard = Heard()
+    config.backend.relearn, config.backend.splice = False, splice
     diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=0.5)
     doubted(optimiser, config, diagnosis, Dispatcher([("heard", heard)]), lambda: False)
-    assert heard.events[-1] == Progress("backwards", COUNT + 2, COUNT + 2)
+    told = [(event.done, event.total) for event in heard.events]
+    total = COUNT + 2 * (1 + splice)
+    assert told[: COUNT + 2] == [(k, total) for k in [*range(COUNT), COUNT + 1, COUNT + 2]]
+    assert told[-1] == (total, total)
+    assert all(isinstance(event, Progress) for event in heard.events)

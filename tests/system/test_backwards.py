@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
+from droidw.geometry.align import umeyama
 from droidw.slam import backwards as module
 from droidw.slam.backend import Backend
-from droidw.slam.backwards import WayBack
 
 DOUBT = ("backend.backwards_below=1", "features=cnn", "uncertainty=affine-softplus", "threads=1")
 FILES = ("trajectory.tum", "keyframes.tum", "points.ply")
@@ -18,7 +21,7 @@ def believed(monkeypatch):
     real = module.track_backwards
 
     def tracked(*arguments):
-        return WayBack(real(*arguments).store, 1.0)
+        return replace(real(*arguments), agreement=1.0)
 
     monkeypatch.setattr(module, "track_backwards", tracked)
 
@@ -26,12 +29,28 @@ def believed(monkeypatch):
 def test_a_run_may_have_the_way_back(go, footage, believed):
     ran = go(footage().folder, *DOUBT, "exporters.depth={}")
     assert ran.code == 0, ran.err
-    assert ran.manifest["backwards"] is True
+    assert ran.manifest["backwards"] == 1.0
     assert ran.manifest["agreement"] == 1.0
     assert ran.manifest["stages"]["backwards"] > 0
     assert len(ran.poses) == 26
     # The first camera is where the world begins, whichever way it was tracked.
     assert ran.poses[0, 1:] == pytest.approx([0, 0, 0, 0, 0, 0, 1], abs=1e-5)
+
+
+def test_a_run_may_be_put_together_from_both_ways(go, footage, believed, monkeypatch):
+    monkeypatch.setattr(module, "pieces", lambda ahead: [k < 3 for k in range(len(ahead))])
+    # As good as it gets there and back: no gain is asked for.
+    monkeypatch.setattr(module, "lead", lambda one, other: one)
+    clip = footage()
+    ran = go(clip.folder, *DOUBT)
+    assert ran.code == 0, ran.err
+    joints = ran.manifest["keyframes"] - 1
+    assert ran.manifest["backwards"] == pytest.approx(1 - 3 / joints, abs=1e-4)
+    # Joined in one scale and world: it goes where a plain run goes.
+    plain = go(clip.folder, *DOUBT, "backend.backwards_below=0", to="to-plain")
+    there, both = plain.poses[:, 1:4], ran.poses[:, 1:4]
+    apart = umeyama(both, there).apply(both) - there
+    assert np.linalg.norm(apart, axis=1).max() < 0.1 * np.ptp(there, axis=0).max()
 
 
 def test_twice_gives_the_same_bytes(go, footage, believed):
@@ -44,7 +63,7 @@ def test_twice_gives_the_same_bytes(go, footage, believed):
 @pytest.mark.parametrize("how", ["fails", "agrees less", "is stopped"])
 def test_the_way_there_is_what_it_would_have_been(go, footage, monkeypatch, how):
     plain = go(footage(name="a").folder, *DOUBT, "backend.backwards_below=0", to="to-a")
-    assert plain.manifest["backwards"] is False
+    assert plain.manifest["backwards"] == 0.0
     assert "backwards" not in plain.manifest["stages"]
     run, real, calls = Backend.run, module.track_backwards, []
 
@@ -58,15 +77,15 @@ def test_the_way_there_is_what_it_would_have_been(go, footage, monkeypatch, how)
         if how == "is stopped":
             return real(optimiser, config, tell, lambda: True)
         back = real(optimiser, config, tell, stopped)
-        return WayBack(back.store, 0.0)
+        return replace(back, agreement=0.0)
 
     if how == "fails":
         monkeypatch.setattr(Backend, "run", second)
     else:
         monkeypatch.setattr(module, "track_backwards", tracked)
-    ran = go(footage(name="b").folder, *DOUBT, to="to-b")
+    ran = go(footage(name="b").folder, *DOUBT, "backend.splice=false", to="to-b")
     assert ran.code == 0, ran.err
-    assert ran.manifest["backwards"] is False
+    assert ran.manifest["backwards"] == 0.0
     assert ("no more" in ran.warnings) == (how == "fails")
     for name in FILES:
         assert (ran.folder / name).read_bytes() == (plain.folder / name).read_bytes(), name
