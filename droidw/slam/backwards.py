@@ -33,6 +33,9 @@ _log = logging.getLogger(__name__)
 
 Tell = Callable[[int, int], None]
 
+# Global passes for a path that was adjusted before, and of which little has changed.
+_PASSES = 2
+
 
 def doubted(
     optimiser: Optimiser,
@@ -98,9 +101,11 @@ class _SecondLook:
         self._events = events
         self._stopped = stopped
         self._done = 0
-        steps, options = sum(config.backend.passes), config.backend
-        rounds = 1 + int(options.splice) + int(options.relearn)
-        self._total = len(optimiser.store) + rounds * steps
+        options = config.backend
+        self._passes = options.passes[-_PASSES:]
+        more = int(options.splice) + int(options.relearn)
+        steps = sum(options.passes) + more * sum(self._passes)
+        self._total = len(optimiser.store) + steps
 
     def run(self) -> None:
         """All of it, with `kept` up to date whenever it is left."""
@@ -145,11 +150,16 @@ class _SecondLook:
         self.kept = replace(self._adjusted(self.kept, learn=True), agreement=agreement)
 
     def _adjusted(self, path: Path, learn: bool) -> Path:
-        """A path after global adjustment."""
+        """A path after the last passes of global adjustment."""
         path.write_to(self.optimiser.store)
         before = self._done
         row = replace(self.config.schedule["global"], learn=learn)
-        config = replace(self.config, schedule={**self.config.schedule, "global": row})
+        config = replace(
+            self.config,
+            schedule={**self.config.schedule, "global": row},
+            # It has been through the wide kernel, which lets weak links drift.
+            backend=replace(self.config.backend, passes=self._passes, wide_start=1.0),
+        )
         backend = Backend(self.optimiser, config)
         backend.run(lambda done, _: self._tell(before + done, self._total))
         return Path.of(self.optimiser.store, backend.agreement)
