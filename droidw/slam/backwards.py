@@ -33,8 +33,8 @@ _log = logging.getLogger(__name__)
 
 Tell = Callable[[int, int], None]
 
-# Global passes for a path that was adjusted before, and of which little has changed.
-_PASSES = 2
+# Global passes for a path of which little has changed since it was adjusted.
+_SPLICE_PASSES = 2
 
 
 def doubted(
@@ -72,7 +72,7 @@ def doubted(
         pass
     except Exception as error:  # noqa: BLE001 - what was found forwards is as good as it was
         why = str(error) or type(error).__name__
-        events.warn(f"the keyframes could not be tracked backwards, what was found is kept: {why}")
+        events.warn(f"tracking the keyframes backwards broke off, the best so far is kept: {why}")
     look.kept.write_to(optimiser.store)
     return replace(found, agreement=look.kept.agreement, backwards=look.share)
 
@@ -102,9 +102,9 @@ class _SecondLook:
         self._stopped = stopped
         self._done = 0
         options = config.backend
-        self._passes = options.passes[-_PASSES:]
-        more = int(options.splice) + int(options.relearn)
-        steps = sum(options.passes) + more * sum(self._passes)
+        self._passes = options.passes
+        steps = (1 + int(options.relearn)) * sum(options.passes)
+        steps += int(options.splice) * sum(options.passes[-_SPLICE_PASSES:])
         self._total = len(optimiser.store) + steps
 
     def run(self) -> None:
@@ -128,16 +128,22 @@ class _SecondLook:
         """Take the pieces of another path in which it agrees more; whether there are any."""
         optimiser, mine = self.optimiser, self.share
         known = support(optimiser, self.kept)
-        taken = pieces(lead(support(optimiser, other), known))
+        ahead = lead(support(optimiser, other), known)
+        taken = pieces(ahead)
         if not any(taken):
             return False
-        found = self._adjusted(spliced(self.kept, other, taken, optimiser.gates()), learn=False)
+        joined = spliced(self.kept, other, taken, optimiser.gates())
+        found = self._adjusted(joined, self._passes[-_SPLICE_PASSES:], learn=False)
         # Global adjustment may have left what was taken for it.
         gained = lead(support(optimiser, found), known)[torch.tensor(taken)].sum()
         holds = float(gained) > 0
-        number = sum(now and not before for before, now in pairwise([False, *taken]))
-        outcome = "kept" if holds else "but do not hold"
-        _log.info("%d pieces of the other way agree more, %s", number, outcome)
+        _log.info(
+            "%d pieces of the other way agree more (leads of %.2f, of %.2f after adjustment), %s",
+            sum(now and not before for before, now in pairwise([False, *taken])),
+            float(ahead[torch.tensor(taken)].sum()),
+            float(gained),
+            "kept" if holds else "left out",
+        )
         if holds:
             part = sum(taken) / len(taken)
             self.kept, self.share = found, mine + part * (1.0 - 2.0 * mine)
@@ -147,10 +153,12 @@ class _SecondLook:
         """Let uncertainty learn from the path that is kept, and the path adjust to that."""
         # What agrees with new weights is nothing to compare with what agreed before.
         agreement = self.kept.agreement
-        self.kept = replace(self._adjusted(self.kept, learn=True), agreement=agreement)
+        self.kept = replace(
+            self._adjusted(self.kept, self._passes, learn=True), agreement=agreement
+        )
 
-    def _adjusted(self, path: Path, learn: bool) -> Path:
-        """A path after the last passes of global adjustment."""
+    def _adjusted(self, path: Path, passes: list[int], learn: bool) -> Path:
+        """A path after passes of global adjustment."""
         path.write_to(self.optimiser.store)
         before = self._done
         row = replace(self.config.schedule["global"], learn=learn)
@@ -158,7 +166,7 @@ class _SecondLook:
             self.config,
             schedule={**self.config.schedule, "global": row},
             # It has been through the wide kernel, which lets weak links drift.
-            backend=replace(self.config.backend, passes=self._passes, wide_start=1.0),
+            backend=replace(self.config.backend, passes=passes, wide_start=1.0),
         )
         backend = Backend(self.optimiser, config)
         backend.run(lambda done, _: self._tell(before + done, self._total))

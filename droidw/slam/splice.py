@@ -22,9 +22,9 @@ __all__ = ["lead", "pieces", "spliced", "support"]
 
 # Keyframes so far apart are matched to see what agrees between them.
 _RADIUS = 3
-# What a piece must gain, in leads summed over its intervals: 6 per cent more that agrees over ten
-# keyframes, or 30 per cent over two.
-_COST = 0.6
+# What a piece must gain, in leads summed over its intervals: 10 per cent more that agrees over ten
+# keyframes, or 50 per cent over two.
+_COST = 1.0
 
 
 def support(optimiser: Optimiser, path: Path) -> Tensor:

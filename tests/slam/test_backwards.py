@@ -143,10 +143,11 @@ class Settled:
         adjusted: agreement after each further global adjustment, or what it fails with.
     Attributes:
         learned: for each further global adjustment, whether uncertainty was to learn.
+        passes: of each of these, all without the wide kernel.
     """
 
     def __init__(self, optimiser, config, monkeypatch, found, agreement=0.5, **more):
-        self.asked, self.learned, self.compared = 0, [], 0
+        self.asked, self.learned, self.passes, self.compared = 0, [], [], 0
         self.more = {"piece": (), "holds": True, "adjusted": 0.7} | more
         self.found = bent(optimiser.store, found) if isinstance(found, float) else found
         monkeypatch.setattr(module, "track_backwards", self.track)
@@ -172,6 +173,8 @@ class Settled:
         return between
 
     def adjust(self, backend, tell):
+        assert backend.config.backend.wide_start == 1.0
+        self.passes.append(backend.config.backend.passes)
         self.learned.append(backend.config.schedule["global"].learn)
         if isinstance(self.more["adjusted"], Exception):
             raise self.more["adjusted"]
@@ -202,10 +205,11 @@ def test_the_way_back_is_kept_where_more_agrees_and_learned_from(optimiser, conf
 
 @pytest.mark.parametrize(("found", "share"), [(0.6, 1 - 4 / 13), (0.4, 4 / 13)])
 def test_pieces_of_the_way_that_agrees_less_are_taken(optimiser, config, monkeypatch, found, share):
-    optimiser.store.disps.fill_(1.0)
+    config.backend.passes = [1, 2, 3]
     made = Settled(optimiser, config, monkeypatch, found, piece=range(3, 7))
     assert (made.kept.agreement, made.kept.backwards) == (0.7, pytest.approx(share))
     assert made.learned == [False, True]
+    assert made.passes == [[2, 3], [1, 2, 3]]
 
 
 def test_pieces_that_global_adjustment_leaves_are_not_kept(optimiser, config, monkeypatch):
