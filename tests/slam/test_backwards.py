@@ -141,6 +141,7 @@ class Settled:
         found: agreement of the way back; None if it was given up, or what it fails with.
         piece: intervals of the other way that agree more, and whether they hold.
         adjusted: agreement after each further global adjustment, or what it fails with.
+        stopped: whether the run is to end, once the way back is found.
     Attributes:
         learned: for each further global adjustment, whether uncertainty was to learn.
         passes: of each of these, all without the wide kernel.
@@ -155,7 +156,8 @@ class Settled:
         monkeypatch.setattr(module.Backend, "run", lambda backend, tell: self.adjust(backend, tell))
         self.events = Dispatcher()
         diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=agreement)
-        self.kept = doubted(optimiser, config, diagnosis, self.events, lambda: False)
+        stopped = self.more.get("stopped", False)
+        self.kept = doubted(optimiser, config, diagnosis, self.events, lambda: stopped)
 
     def track(self, *arguments):
         self.asked += 1
@@ -236,6 +238,17 @@ def test_what_fails_after_the_way_back_leaves_it(optimiser, config, monkeypatch,
     assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
     assert torch.equal(optimiser.store.T_cw, other.T_cw)
     assert any("no memory" in text for text in made.events.warnings)
+
+
+@pytest.mark.parametrize("piece", [(), range(3, 7)])
+def test_a_run_that_is_to_end_keeps_the_best_so_far(optimiser, config, monkeypatch, piece):
+    other = bent(optimiser.store, 0.6)
+    made = Settled(optimiser, config, monkeypatch, 0.6, piece=piece, stopped=True)
+    assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
+    assert torch.equal(optimiser.store.T_cw, other.T_cw)
+    assert torch.equal(optimiser.store.disps, other.disps)
+    assert made.events.warnings == []
+    assert len(made.learned) == 1  # given up in the first that was begun
 
 
 @pytest.mark.parametrize(
