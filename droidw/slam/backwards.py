@@ -94,15 +94,13 @@ class _SecondLook:
         stopped: Callable[[], bool],
     ) -> None:
         self.optimiser = optimiser
-        # The focal length is as good as it gets from a path that is in doubt.
-        self.config = replace(config, camera=replace(config.camera, refine_focal=False))
+        self.config = config
         self.kept = Path.of(optimiser.store, agreement)
         self.share = 0.0
         self._events = events
         self._stopped = stopped
         self._done = 0
         options = config.backend
-        self._passes = options.passes
         steps = (1 + int(options.relearn)) * sum(options.passes)
         steps += int(options.splice) * sum(options.passes[-_SPLICE_PASSES:])
         self._total = len(optimiser.store) + steps
@@ -117,45 +115,43 @@ class _SecondLook:
         _log.info("%.0f %% agrees backwards%s", 100 * back.agreement, ", kept" if better else "")
         if better:
             self.kept, self.share = back, 1.0
-        changed = better
         if options.splice:
-            changed |= self._splice(there if better else back)
-        if options.relearn and changed:
+            self._splice(there if better else back)
+        if options.relearn and self.kept is not there:
             self._relearn()
         self._events.emit(Progress("backwards", self._total, self._total))
 
-    def _splice(self, other: Path) -> bool:
-        """Take the pieces of another path in which it agrees more; whether there are any."""
-        optimiser, mine = self.optimiser, self.share
+    def _splice(self, other: Path) -> None:
+        """Take the pieces of another path in which it agrees more."""
+        optimiser, passes = self.optimiser, self.config.backend.passes
         known = support(optimiser, self.kept)
         ahead = lead(support(optimiser, other), known)
         taken = pieces(ahead)
         if not any(taken):
-            return False
+            return
+        inside = torch.tensor(taken)
         joined = spliced(self.kept, other, taken, optimiser.gates())
-        found = self._adjusted(joined, self._passes[-_SPLICE_PASSES:], learn=False)
+        found = self._adjusted(joined, passes[-_SPLICE_PASSES:], learn=False)
         # Global adjustment may have left what was taken for it.
-        gained = lead(support(optimiser, found), known)[torch.tensor(taken)].sum()
-        holds = float(gained) > 0
+        gained = float(lead(support(optimiser, found), known)[inside].sum())
+        holds = gained > 0
         _log.info(
             "%d pieces of the other way agree more (leads of %.2f, of %.2f after adjustment), %s",
             sum(now and not before for before, now in pairwise([False, *taken])),
-            float(ahead[torch.tensor(taken)].sum()),
-            float(gained),
+            float(ahead[inside].sum()),
+            gained,
             "kept" if holds else "left out",
         )
         if holds:
             part = sum(taken) / len(taken)
-            self.kept, self.share = found, mine + part * (1.0 - 2.0 * mine)
-        return holds
+            self.kept, self.share = found, abs(self.share - part)
 
     def _relearn(self) -> None:
         """Let uncertainty learn from the path that is kept, and the path adjust to that."""
         # What agrees with new weights is nothing to compare with what agreed before.
         agreement = self.kept.agreement
-        self.kept = replace(
-            self._adjusted(self.kept, self._passes, learn=True), agreement=agreement
-        )
+        found = self._adjusted(self.kept, self.config.backend.passes, learn=True)
+        self.kept = replace(found, agreement=agreement)
 
     def _adjusted(self, path: Path, passes: list[int], learn: bool) -> Path:
         """A path after passes of global adjustment."""
@@ -167,6 +163,7 @@ class _SecondLook:
             schedule={**self.config.schedule, "global": row},
             # It has been through the wide kernel, which lets weak links drift.
             backend=replace(self.config.backend, passes=passes, wide_start=1.0),
+            camera=replace(self.config.camera, refine_focal=False),
         )
         backend = Backend(self.optimiser, config)
         backend.run(lambda done, _: self._tell(before + done, self._total))

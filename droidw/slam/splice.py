@@ -49,6 +49,7 @@ def support(optimiser: Optimiser, path: Path) -> Tensor:
     for row, weight in zip(rows, agreeing.double().cpu(), strict=True):
         low, high = sorted((graph.ii[row], graph.jj[row]))
         between[low:high] += weight / (high - low)
+    # Measuring has left the damping of its own matches.
     path.write_to(store)
     return between
 

@@ -124,8 +124,8 @@ def agreeing_share(residual: Tensor, weight: Tensor, scale: float, nothing: floa
     Returns:
         A scalar on the device.
     """
-    agreeing = agreeing_weight(residual, weight, scale).sum()
-    total = torch.where(_known(residual, weight), weight, 0.0).sum()
+    left, known = _agreeing(residual, weight, scale)
+    agreeing, total = left.sum(), known.sum()
     return torch.where(total > 0, agreeing / total.clamp_min(1e-6), nothing)
 
 
@@ -135,13 +135,15 @@ def agreeing_weight(residual: Tensor, weight: Tensor, scale: float) -> Tensor:
     Args:
         residual, weight, scale: as of `agreeing_share`.
     """
-    known = _known(residual, weight)
+    return _agreeing(residual, weight, scale)[0]
+
+
+def _agreeing(residual: Tensor, weight: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    """What is left of each weight, and the weight itself; both 0 where nothing was measured."""
+    known = torch.isfinite(residual) & torch.isfinite(weight)
+    weight = torch.where(known, weight, 0.0)
     apart = torch.where(known, residual, 0.0)
-    return torch.where(known, weight, 0.0) / (1.0 + (apart / scale).square_())
-
-
-def _known(residual: Tensor, weight: Tensor) -> Tensor:
-    return torch.isfinite(residual) & torch.isfinite(weight)
+    return weight / (1.0 + (apart / scale).square_()), weight
 
 
 def _gate_at(gates: Tensor, target: Tensor) -> Tensor:

@@ -144,9 +144,8 @@ def _tiles(result: RunResult, paths: Paths, metrics: Mapping[str, Any]) -> str:
     if agreement is not None:
         told = ["tracked twice"] if manifest.get("sweeps") == 2 else []
         share = number(manifest.get("backwards")) or 0.0
-        told += [f"{share:.0%} of it backwards" if share < 1 else "backwards in the end"] * (
-            share > 0
-        )
+        if share > 0:
+            told.append(f"{share:.0%} of it backwards" if share < 1 else "backwards in the end")
         tiles.append(tile(f"{100 * agreement:.0f}", "%", "of matches agree", ", ".join(told)))
     ate = number(metrics.get("ate_rmse"))
     unit = str(metrics.get("unit", paths.unit or "m"))
