@@ -39,8 +39,9 @@ _FULL_FIELDS = 64
 _TRACKED = 0.1
 # Grid flows kept for the filler: some ten kilobytes each.
 _GRID_FIELDS = 20_000
-# Median distance of two starts, in cells, that lead to the same result.
-_SAME_START = 0.03
+# Median distance of two starts, in cells, that lead to the same result: a search goes on from the
+# coarsest level, where a pixel is little.
+_SAME_START = 0.15
 # Checked pairs kept for the next session that asks for them: some forty kilobytes each.
 _PAIRS = 4_000
 
