@@ -7,12 +7,56 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import torch
 
 if TYPE_CHECKING:
     import numpy.typing as npt
     from torch import Tensor
 
-__all__ = ["BAProblem", "Report", "Step"]
+__all__ = ["BAProblem", "PoseTerm", "Report", "Step"]
+
+
+@dataclass(frozen=True)
+class PoseTerm:
+    """What is known of the poses besides matches: the energy `x^T H x - 2 g^T x` of their step x.
+
+    x holds the tangent vectors (translation first) of all poses at the start of the step, and H is
+    a band: poses further apart in the sequence than its width do not meet.
+
+    Attributes:
+        band: [N,B+1,6,6] float64; block [k,m] is H at (k, k - m), row k and the column m before it.
+            Blocks [k,0] are symmetric; those with m > k are not read.
+        rhs: [N,6] float64, g.
+    """
+
+    band: Tensor
+    rhs: Tensor
+
+    def check(self, frames: int) -> None:
+        """That it is one of so many poses.
+
+        Raises:
+            ValueError: band or right side have another shape.
+        """
+        shapes = {"band": (frames, *self.band.shape[1:2], 6, 6), "rhs": (frames, 6)}
+        for name, shape in shapes.items():
+            found = tuple(getattr(self, name).shape)
+            if found != shape:
+                raise ValueError(f"BAProblem.pose_term.{name} has the shape {found}, not {shape}")
+
+    def to(self, device: torch.device) -> PoseTerm:
+        """The same on a device, in float64."""
+        return PoseTerm(self.band.to(device, torch.float64), self.rhs.to(device, torch.float64))
+
+    def energy(self, steps: Tensor) -> Tensor:
+        """Of steps [N,6] float64, a scalar; 0 without a step."""
+        total = -2.0 * (self.rhs * steps).sum()
+        for m in range(min(self.band.shape[1], len(steps))):
+            product = torch.einsum(
+                "ni,nij,nj->", steps[m:], self.band[m:, m], steps[: len(steps) - m]
+            )
+            total = total + (1.0 if m == 0 else 2.0) * product
+        return total
 
 
 @dataclass(frozen=True)
@@ -21,7 +65,8 @@ class BAProblem:
 
     Energy: sum over edges and cells of `r^T W r` with the residual r = target - projection and the
     information W = [[xx, xy], [xy, yy]] of `weight`, robust if `huber` says so, plus
-    `prior_weight * (disp - prior)^2` where `prior > 0`, plus `damping * step^2` elsewhere.
+    `prior_weight * (disp - prior)^2` where `prior > 0`, plus `damping * step^2` elsewhere, plus
+    what `pose_term` says of the step of the poses.
 
     Attributes:
         T_cw: [N,7] world to camera, translation then unit quaternion xyzw.
@@ -36,6 +81,8 @@ class BAProblem:
         damping: [N,h,w] added to the depth diagonal where there is no prior.
         prior: [N,h,w] inverse depth of a depth prior, 0 where there is none; or None.
         prior_weight: gamma_d of REFERENCE 3.2.
+        pose_term: what is known of the poses besides; or None. It does not count as a measurement
+            of a pose that has none. A backend without it takes the step of None.
         motion_only: move poses, leave depths.
         lm, ep: diag(S) <- diag(S) * (1 + lm) + ep on the reduced system.
         huber: threshold in cells of a Huber kernel on the residual length s, or None;
@@ -58,6 +105,7 @@ class BAProblem:
     damping: Tensor
     prior: Tensor | None = None
     prior_weight: float = 0.0
+    pose_term: PoseTerm | None = None
     motion_only: bool = False
     lm: float = 1e-4
     ep: float = 0.1

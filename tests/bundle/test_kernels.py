@@ -12,6 +12,7 @@ import torch
 
 from droidw.errors import MissingRequirementError
 from droidw.plugin.component import BuildContext
+from droidw.solve.problem import PoseTerm
 from droidw_plugins.bundle import _kernel_calls, cuda_ba
 from droidw_plugins.bundle._build import BuildError
 from droidw_plugins.bundle._kernel_layout import TILE, make_kernel_layout
@@ -42,6 +43,24 @@ def test_an_edge_to_nowhere_is_refused(make, backends):
     p, _, _ = make()
     with pytest.raises(ValueError, match="jj"):
         backends["host"]().step(replace(p, jj=torch.full_like(p.jj, 9)))
+
+
+def test_tiles_hold_a_term_of_poses_without_an_edge(make, backends):
+    # 70 poses in three pieces, each in a tile of its own: the term alone joins them
+    p, _, _ = make(n=70, h=3, w=4, reach=2, noise=0.005, ep=1e-2)
+    wide = TILE // 6
+    keep = p.ii // wide == p.jj // wide
+    band = torch.zeros(70, 2, 6, 6, dtype=torch.float64)
+    band[:, 0], band[:, 1] = 2 * torch.eye(6), -torch.eye(6)
+    term = PoseTerm(band, torch.linspace(-1, 1, 420, dtype=torch.float64).view(70, 6))
+    p = replace(
+        p, ii=p.ii[keep], jj=p.jj[keep], target=p.target[keep], weight=p.weight[keep],
+        damping=torch.full_like(p.disps, 1e-3), pose_term=term,
+    )  # fmt: skip
+    expected = backends["torch"]().step(p)
+    for got in (backends["host"]().step(p), backends["host"](tiled_from=1).step(p)):
+        torch.testing.assert_close(got.T_cw, expected.T_cw, atol=1e-9, rtol=0)
+        torch.testing.assert_close(got.disps, expected.disps, atol=1e-8, rtol=0)
 
 
 @pytest.mark.parametrize("motion_only", [False, True])

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from droidw.geometry import projective, se3
+from droidw.solve.problem import PoseTerm
 
 
 def matrices(weight):
@@ -26,6 +27,34 @@ def robust_length(weight, r):
     mean = weight[..., :2].mean(-1, keepdim=True)
     # a cell without any weight has no length, and one of rank 1 a square of -0 by rounding
     return (squared(weight, r).clamp_min(1e-300) / mean.clamp_min(1e-300)).sqrt()
+
+
+def dense_band(band):
+    """The matrix [6N,6N] of a term of the poses."""
+    n = len(band)
+    H = torch.zeros(n, 6, n, 6, dtype=torch.float64)
+    for k in range(n):
+        for m in range(min(band.shape[1], k + 1)):
+            H[k, :, k - m] = band[k, m]
+            H[k - m, :, k] = band[k, m].T
+    return H.view(6 * n, 6 * n)
+
+
+def pose_term_of(n, reach, seed=0):
+    """Some term whose matrix is J^T J; blocks of poses that do not exist are NaN."""
+    g = torch.Generator().manual_seed(seed)
+    J = torch.randn(n, reach + 1, 5, 6, generator=g, dtype=torch.float64)
+    H = torch.zeros(n + reach, 6, n + reach, 6, dtype=torch.float64)
+    for k in range(n):
+        row = torch.zeros(5, n + reach, 6, dtype=torch.float64)
+        row[:, k : k + reach + 1] = J[k].transpose(0, 1)
+        H += torch.einsum("rak,rbl->akbl", row, row)
+    H = H[:n, :, :n]
+    band = torch.full((n, reach + 1, 6, 6), torch.nan, dtype=torch.float64)
+    for k in range(n):
+        for m in range(min(reach, k) + 1):
+            band[k, m] = H[k, :, k - m]
+    return PoseTerm(band, torch.randn(n, 6, generator=g, dtype=torch.float64))
 
 
 def dense_step(p):
@@ -60,6 +89,9 @@ def dense_step(p):
         diagonal = torch.where(known, torch.full_like(d, p.prior_weight), diagonal)
         g[n_pose:] -= torch.where(known, p.prior_weight * (d - p.prior.flatten()), 0 * d)
     H[n_pose:, n_pose:] += torch.diag(diagonal)
+    if p.pose_term is not None:
+        H[:n_pose, :n_pose] += dense_band(p.pose_term.band)
+        g[:n_pose] += p.pose_term.rhs.view(-1)
     free = torch.nonzero((~p.fixed)[:, None].expand(n, 6).flatten()).flatten()
     deep = n_pose + torch.nonzero(moves[:, None].expand(n, cells).flatten()).flatten()
     A, b = H[free][:, free], g[free]
@@ -125,6 +157,57 @@ def test_schur_solution_is_the_dense_one(make, case, with_prior, step):
     torch.testing.assert_close(got.disps, disps, atol=1e-8, rtol=0)
     assert got.report.step_norm == pytest.approx(float(dx.norm(dim=1).max()), abs=1e-8)
     assert torch.equal(got.T_cw[p.fixed], p.T_cw[p.fixed])
+
+
+@pytest.mark.parametrize("reach", [0, 2, 4, 6])
+@pytest.mark.parametrize("case", CASES)
+def test_a_term_of_the_poses_is_part_of_the_system(make, case, reach, step):
+    changes = dict(CASES[case])
+    left_out = changes.pop("leave_out_source", None)
+    p, _, _ = make(noise=0.02, **changes)
+    p = replace(p, pose_term=pose_term_of(5, reach), damping=torch.full_like(p.disps, 1e-2))
+    if left_out is not None:
+        keep = p.ii != left_out
+        p = replace(p, ii=p.ii[keep], jj=p.jj[keep], target=p.target[keep], weight=p.weight[keep])
+    T_cw, disps, _ = dense_step(p)
+    got = step(p)
+    assert got.report.status == "ok"
+    torch.testing.assert_close(got.T_cw, T_cw, atol=1e-8, rtol=0)
+    torch.testing.assert_close(got.disps, disps, atol=1e-8, rtol=0)
+
+
+def test_a_term_of_the_poses_is_no_measurement(make, step):
+    p, _, _ = make(noise=0.02)
+    keep = (p.ii != 4) & (p.jj != 4)
+    p = replace(p, ii=p.ii[keep], jj=p.jj[keep], target=p.target[keep], weight=p.weight[keep])
+    got = step(replace(p, pose_term=pose_term_of(5, 2)))
+    assert got.report.isolated == (4,)
+    assert torch.equal(got.T_cw[4], p.T_cw[4])
+    assert not torch.equal(got.T_cw[3], step(p).T_cw[3])
+
+
+def test_a_guarded_step_counts_the_term_of_the_poses(make, step):
+    p, _, _ = make(noise=0.02, guard=True)
+    term = pose_term_of(5, 2)
+    before, (T_cw, disps, dx) = step(p).report.cost_before, dense_step(replace(p, pose_term=term))
+    report = step(replace(p, pose_term=term)).report
+    x = dx.view(-1)
+    known = float(x @ dense_band(term.band) @ x - 2 * term.rhs.view(-1) @ x)
+    coords, valid = projective.reproject(T_cw, disps, p.intrinsics, p.ii, p.jj)
+    rest = float((squared(p.weight, p.target - coords) * valid[..., None]).sum())
+    assert report.cost_before == pytest.approx(before, rel=1e-12)
+    assert report.cost_after == pytest.approx(rest + known, rel=1e-9)
+    # a term that calls every step of the measurements bad
+    against = replace(term, band=1e9 * torch.eye(6, dtype=torch.float64).expand(5, 1, 6, 6))
+    assert step(replace(p, pose_term=replace(against, rhs=0 * term.rhs))).report.step_norm < 1e-6
+
+
+@pytest.mark.parametrize("name", ["band", "rhs"])
+def test_a_term_of_other_poses_is_refused(make, step, name):
+    p, _, _ = make()
+    term = pose_term_of(5, 2)
+    with pytest.raises(ValueError, match=f"pose_term.{name}"):
+        step(replace(p, pose_term=replace(term, **{name: getattr(term, name)[1:]})))
 
 
 def test_near_cells_do_not_count(make, step):

@@ -14,7 +14,12 @@ from droidw.geometry.transfer import on_device
 from droidw.solve.problem import BAProblem, Report, Step
 from droidw_plugins.bundle._layout import Layout, Workspace, make_layout
 from droidw_plugins.bundle._linearise import EdgeSums, edge_motions, energy, linearise
-from droidw_plugins.bundle._schur import back_substitute, reduce_system, solve_reduced
+from droidw_plugins.bundle._schur import (
+    add_pose_term,
+    back_substitute,
+    reduce_system,
+    solve_reduced,
+)
 
 __all__ = ["gauss_newton_step"]
 
@@ -34,6 +39,8 @@ def gauss_newton_step(problem: BAProblem, work: Workspace, chunk: int, halvings:
         halvings: with `problem.guard`, how often a step that raised the energy is halved.
     """
     layout = make_layout(problem)
+    if problem.pose_term is not None:
+        problem.pose_term.check(len(problem.T_cw))
     T64 = problem.T_cw.double()
     motions = edge_motions(problem.T_cw, layout)
     # the sums hold the energy at the start, but neither a robust one nor one to compare with
@@ -59,6 +66,8 @@ def gauss_newton_step(problem: BAProblem, work: Workspace, chunk: int, halvings:
     slots[free] = torch.arange(n_free, device=free.device)
     adjoints = motions.adjoints()
     S, g, depth = reduce_system(problem, layout, sums, adjoints, slots, n_free, work)
+    if problem.pose_term is not None:
+        add_pose_term(S, g, problem.pose_term, slots, n_free)
     dx = torch.zeros(problem.T_cw.shape[0], 6, dtype=torch.float64, device=S.device)
     sound = torch.ones((), dtype=torch.bool, device=S.device)
     if n_free:
@@ -81,6 +90,8 @@ def gauss_newton_step(problem: BAProblem, work: Workspace, chunk: int, halvings:
         if compared and sums.valid is not None:
             told.append(energy(problem, layout, T_new, disps_new, sums.valid, work, chunk))
             told.append(_prior_energy(problem, disps_new))
+            if problem.pose_term is not None:
+                told.append(problem.pose_term.energy(scale * dx))
         well, step_finite, state_finite, size, *after = _read(told)
         if not well:
             return _unchanged(problem, replace(report, status="singular"))
@@ -89,7 +100,7 @@ def gauss_newton_step(problem: BAProblem, work: Workspace, chunk: int, halvings:
         done = replace(report, step_norm=size)
         if not compared:
             return Step(T_new, disps_new, done)
-        reached = after[0] + problem.prior_weight * after[1]
+        reached = after[0] + problem.prior_weight * after[1] + sum(after[2:])
         if reached <= before:
             return Step(T_new, disps_new, replace(done, cost_after=reached))
     return _unchanged(problem, replace(report, status="rejected", cost_after=before))

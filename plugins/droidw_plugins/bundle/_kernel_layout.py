@@ -70,6 +70,8 @@ class KernelLayout:
         arrays: int64 tensors by name.
         sources, pairs, blocks: how many there are.
         tiles: how the system is stored, or None where it is one dense matrix.
+        band: [F,B+1] where the blocks of `PoseTerm.band` begin in it, the first one of the system
+            for those that do not exist; None without such a term.
     """
 
     ii: Tensor
@@ -80,6 +82,7 @@ class KernelLayout:
     pairs: int
     blocks: int
     tiles: TilePlan | None
+    band: Tensor | None
 
     @property
     def stride(self) -> int:
@@ -100,6 +103,7 @@ def make_kernel_layout(
     frames: int,
     tiled_from: int = TILED_FROM,
     host: tuple[Ints, Ints] | None = None,
+    reach: int | None = None,
 ) -> KernelLayout:
     """Sorts the edges [E] and lists which sums belong to which block of the system.
 
@@ -108,6 +112,7 @@ def make_kernel_layout(
         frames: number of frames.
         tiled_from: frames from which on tiles are used.
         host: the same edges on the host, if they are known there.
+        reach: B of `PoseTerm.band`, if there is one.
 
     Raises:
         ValueError: an edge names a frame that does not exist.
@@ -138,7 +143,16 @@ def make_kernel_layout(
     key, parts = key[sort], parts[sort]
     first = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1]))) if key.size else key
     block_row, block_col = key[first] // frames, key[first] % frames
-    tiles = _tile_plan(block_row, block_col, frames, ii.device) if frames >= tiled_from else None
+    band_row = np.repeat(np.arange(frames), 0 if reach is None else reach + 1)
+    band_col = band_row - np.arange(band_row.size) % ((reach or 0) + 1)
+    inside = band_col >= 0
+    tiles = None
+    if frames >= tiled_from:
+        met_row = np.concatenate((block_row, band_row[inside]))
+        met_col = np.concatenate((block_col, band_col[inside]))
+        tiles = _tile_plan(met_row, met_col, frames, ii.device)
+    places = np.zeros_like(band_row)
+    places[inside] = _places(band_row[inside], band_col[inside], frames, tiles)
     named = {
         "order": order,
         "ii": i,
@@ -169,6 +183,9 @@ def make_kernel_layout(
         pairs=int(pair_a.size),
         blocks=int(first.size),
         tiles=tiles,
+        band=None
+        if reach is None
+        else upload(torch.from_numpy(places), ii.device).view(frames, -1),
     )
 
 

@@ -89,7 +89,12 @@ class _Scratch:
 
 def _key(problem: BAProblem) -> tuple[Any, ...]:
     d = problem.disps
-    return (d.shape, d.dtype, d.device, problem.ii.shape, problem.motion_only)
+    return (d.shape, d.dtype, d.device, problem.ii.shape, problem.motion_only, _reach(problem))
+
+
+def _reach(problem: BAProblem) -> int | None:
+    """How far apart poses meet in the term of the poses; None without one."""
+    return None if problem.pose_term is None else problem.pose_term.band.shape[1] - 1
 
 
 class KernelStepper:
@@ -144,7 +149,7 @@ class KernelStepper:
             return held, problem.pairs is not None
         frames = problem.disps.shape[0]
         layout = make_kernel_layout(
-            problem.ii, problem.jj, frames, self._tiled_from, problem.edges()
+            problem.ii, problem.jj, frames, self._tiled_from, problem.edges(), _reach(problem)
         )
         self._scratch = None  # its memory first, so that both need not fit
         self._scratch = _Scratch(problem, layout)
@@ -178,6 +183,8 @@ class _Attempt:
         s.flags.zero_()
         s.system.zero_()
         self._call("system")
+        if s.layout.band is not None:
+            self._add_pose_term(s.layout.band)
         tiles = s.layout.tiles
         if tiles is None:
             dx, factor, info = solve_dense(s.system.view(6 * n, 6 * n), s.g)
@@ -201,10 +208,29 @@ class _Attempt:
             norm=max(states[n:]),
         )
 
+    def _add_pose_term(self, places: Tensor) -> None:
+        """Adds the term of the poses, damped like the rest, to the system and its right side."""
+        s, p, n = self._scratch, self.problem, self.problem.disps.shape[0]
+        assert p.pose_term is not None
+        moves = s.held["free"] == 1
+        rhs = torch.where(moves[:, None], p.pose_term.rhs, 0.0)
+        s.g += rhs.view(-1)
+        blocks = p.pose_term.band.clone()
+        blocks[:, 0].diagonal(dim1=-2, dim2=-1).mul_(1.0 + p.lm)
+        before = torch.arange(n, device=moves.device)[:, None] - torch.arange(
+            blocks.shape[1], device=moves.device
+        )
+        both = (before >= 0) & moves[:, None] & moves[before.clamp_min(0)]
+        blocks = torch.where(both[..., None, None], blocks, 0.0)
+        six = torch.arange(6, device=moves.device)
+        at = places[..., None, None] + s.layout.stride * six[:, None] + six
+        # blocks have places of their own; those that are left out add nothing to the first one
+        s.system.index_add_(0, at.view(-1), blocks.view(-1))
+
     def conclude(self, found: _Found, halvings: int) -> Step:
         """The step, shortened if it is guarded and raised the energy, or the input again."""
         p = self.problem
-        before = found.energy + p.prior_weight * found.prior
+        before = found.energy + p.prior_weight * found.prior  # the term of the poses is 0 there
         isolated = tuple(k for k, state in enumerate(found.free) if state < 0)
         report = Report("ok", before, dropped=found.dropped, isolated=isolated)
         moves = 1 in found.free
@@ -222,18 +248,20 @@ class _Attempt:
             if attempt:
                 self._scratch.job.scale = scale
                 self._call("move")
-            after = self._energy()
+            after = self._energy(scale)
             if after <= before:
                 done = replace(report, step_norm=scale * found.norm, cost_after=after)
                 return Step(self.T_out, self.disps_out, done)
         return self._unchanged(replace(report, status="rejected", step_norm=0.0, cost_after=before))
 
-    def _energy(self) -> float:
-        """Energy of the moved state."""
+    def _energy(self, scale: float) -> float:
+        """Energy of the state after a scaled step."""
         state = (self.T_out, self.disps_out, self._scratch.moved)
         self._call("energy", *(tensor.data_ptr() for tensor in state))
         energy, _, prior = self._scratch.told[_FLAGS : _FLAGS + 3].tolist()
-        return float(energy + self.problem.prior_weight * prior)
+        term = self.problem.pose_term
+        known = 0.0 if term is None else float(term.energy(scale * self._dx.view(-1, 6)))
+        return float(energy + self.problem.prior_weight * prior + known)
 
     def _unchanged(self, report: Report) -> Step:
         return Step(self.problem.T_cw.clone(), self.problem.disps.clone(), report)
@@ -261,6 +289,9 @@ def _ready(problem: BAProblem) -> BAProblem:
         if tuple(value.shape) != shape:
             raise ValueError(f"BAProblem.{name} has the shape {tuple(value.shape)}, not {shape}")
         ready[name] = value.to(device, dtype).contiguous()
+    if problem.pose_term is not None:
+        problem.pose_term.check(n)
+        ready["pose_term"] = problem.pose_term.to(device)
     for name, kind in (("ii", torch.int64), ("jj", torch.int64), ("fixed", torch.bool)):
         ready[name] = getattr(problem, name).to(device, kind).contiguous()
     return replace(problem, **ready)

@@ -25,7 +25,7 @@ from droidw_plugins.bundle._build import (
 
 __all__ = ["NativeKernels", "load_native", "native_recipe"]
 
-_VERSION = 2
+_VERSION = 3
 _STATUS = ("ok", "rejected", "singular", "nonfinite", "empty")
 _COMPILERS = ("c++", "g++", "clang++")
 _PLAIN = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
@@ -37,7 +37,8 @@ class _Problem(ctypes.Structure):
     _fields_: ClassVar = [
         *((name, c_int64) for name in ("frames", "edges", "height", "width", "channels")),
         *((name, c_void_p) for name in ("ii", "jj", "T_cw", "disps", "target", "weight")),
-        *((name, c_void_p) for name in ("damping", "prior", "fixed")),
+        *((name, c_void_p) for name in ("damping", "prior", "fixed", "band", "band_rhs")),
+        ("reach", c_int64),
         *((name, c_double) for name in ("fx", "fy", "cx", "cy")),
         *((name, c_double) for name in ("prior_weight", "lm", "ep", "huber")),
         *((name, c_double) for name in ("min_disp", "max_disp")),
@@ -155,6 +156,10 @@ class NativeKernels:
         if problem.prior is not None and problem.prior_weight > 0:
             prior = ready(problem.prior)
         fixed = problem.fixed.to("cpu", torch.bool).contiguous()
+        band = rhs = None
+        if problem.pose_term is not None:
+            term = problem.pose_term.to(torch.device("cpu"))
+            band, rhs = term.band.contiguous(), term.rhs.contiguous()
         fx, fy, cx, cy = problem.intrinsics.tolist()
         T_out, disps_out = torch.empty_like(T_cw), torch.empty_like(disps)
         isolated = torch.empty(n, dtype=torch.int64)
@@ -163,6 +168,8 @@ class NativeKernels:
             ii.data_ptr(), jj.data_ptr(), T_cw.data_ptr(), disps.data_ptr(),
             target.data_ptr(), weight.data_ptr(), damping.data_ptr(),
             None if prior is None else prior.data_ptr(), fixed.data_ptr(),
+            None if band is None else band.data_ptr(), None if rhs is None else rhs.data_ptr(),
+            -1 if band is None else band.shape[1] - 1,
             fx, fy, cx, cy,
             problem.prior_weight, problem.lm, problem.ep,
             -1.0 if problem.huber is None else problem.huber,
@@ -194,6 +201,8 @@ def _check(problem: BAProblem, n: int, edges: int, h: int, w: int) -> None:
     }  # fmt: skip
     if problem.prior is not None:
         shapes["prior"] = (n, h, w)
+    if problem.pose_term is not None:
+        problem.pose_term.check(n)
     for name, shape in shapes.items():
         found = tuple(getattr(problem, name).shape)
         if found != shape:

@@ -8,11 +8,17 @@ import torch
 from torch import Tensor
 
 from droidw.geometry.transfer import on_device
-from droidw.solve.problem import BAProblem
+from droidw.solve.problem import BAProblem, PoseTerm
 from droidw_plugins.bundle._layout import Layout, Workspace
 from droidw_plugins.bundle._linearise import SIGNS, EdgeSums
 
-__all__ = ["DepthSystem", "back_substitute", "reduce_system", "solve_reduced"]
+__all__ = [
+    "DepthSystem",
+    "add_pose_term",
+    "back_substitute",
+    "reduce_system",
+    "solve_reduced",
+]
 
 
 @dataclass(frozen=True)
@@ -83,6 +89,26 @@ def reduce_system(
     g.index_add_(0, sj, rhs)
     full = S.view(stack, stack, 6, 6)[:n_free, :n_free].permute(0, 2, 1, 3)
     return full.reshape(6 * n_free, 6 * n_free), g[:n_free].reshape(-1), depth
+
+
+def add_pose_term(S: Tensor, g: Tensor, term: PoseTerm, slots: Tensor, n_free: int) -> None:
+    """Adds the band of the term to S [6F,6F] and its right side to g [6F], in place.
+
+    Args:
+        slots, n_free: as in `reduce_system`; poses that stay have no part in it.
+    """
+    blocks, right = S.view(n_free, 6, n_free, 6), g.view(n_free, 6)
+    moves = slots < n_free
+    term = term.to(S.device)
+    right += term.rhs[moves]
+    for m in range(min(term.band.shape[1], len(slots))):
+        row, column = slots[m:], slots[: len(slots) - m]
+        both = (row < n_free) & (column < n_free)
+        row, column, block = row[both], column[both], term.band[m:, m][both]
+        # each block has a place of its own, so that no sum depends on an order
+        blocks[row, :, column] += block
+        if m:
+            blocks[column, :, row] += block.transpose(1, 2)
 
 
 def solve_reduced(

@@ -55,7 +55,8 @@ class Stepper {
             std::vector<Motion<double>> moved(p_.edges);
             motions_of(static_cast<const S*>(p_.T_out), moved);
             const View<S, CROSS> now(p_, work_, p_.disps_out);
-            const double after = energy(now, moved.data()) + prior_energy(now.disps);
+            const double after =
+                energy(now, moved.data()) + prior_energy(now.disps) + band_energy(scale);
             if (after <= report_.cost_before) {
                 report_.cost_after = after;
                 return done();
@@ -191,6 +192,23 @@ class Stepper {
         return p_.prior_weight * sum;
     }
 
+    // x^T H x - 2 g^T x of a scaled step.
+    double band_energy(double scale) const {
+        double sum = 0;
+        for (int64_t k = 0; p_.reach >= 0 && k < p_.frames; ++k) {
+            const double* x = work_.dx.data() + 6 * k;
+            for (int64_t m = 0; m <= std::min(p_.reach, k); ++m) {
+                const double* X = p_.band + (k * (p_.reach + 1) + m) * 36;
+                double product = 0;
+                for (int r = 0; r < 6; ++r)
+                    for (int c = 0; c < 6; ++c) product += x[r] * X[6 * r + c] * x[c - 6 * m];
+                sum += (m == 0 ? 1 : 2) * scale * scale * product;
+            }
+            for (int q = 0; q < 6; ++q) sum -= 2 * scale * p_.band_rhs[6 * k + q] * x[q];
+        }
+        return sum;
+    }
+
     double energy(const View<S, CROSS>& now, const Motion<double>* moved) {
         const std::vector<Unit>& units = work_.plan.units;
         std::vector<double> parts(units.size());
@@ -205,8 +223,9 @@ class Stepper {
     bool solve(int64_t n) {
         System<S> system{work_, n};
         work_.inverse.resize(6 * n);
-        system.shape();
+        system.shape(p_);
         system.assemble(!p_.motion_only);
+        system.add_band(p_);
         // least share of its diagonal entry that is taken for information and not for rounding
         const double floor = sizeof(S) == 8 ? 1e-11 : 1e-5;
         if (!system.factorise(p_.lm, p_.ep, floor)) return false;
@@ -310,7 +329,7 @@ struct Handle {
 extern "C" {
 
 // Raised whenever the layout of `Problem` or `Report` changes.
-int32_t dw_native_version() { return 2; }
+int32_t dw_native_version() { return 3; }
 
 void* dw_native_open() { return new (std::nothrow) dw::Handle(); }
 

@@ -17,6 +17,8 @@ struct Problem {
     const int64_t *ii, *jj;
     const void *T_cw, *disps, *target, *weight, *damping, *prior;  // prior may be null
     const uint8_t* fixed;
+    const double *band, *band_rhs;  // what is known of poses besides: [frames, reach + 1, 36], [frames, 6]
+    int64_t reach;                  // -1 where there is none
     double fx, fy, cx, cy;
     double prior_weight, lm, ep, huber, min_disp, max_disp;  // huber < 0: none
     int32_t motion_only, guard, halvings, threads;

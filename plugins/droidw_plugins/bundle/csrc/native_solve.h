@@ -36,8 +36,8 @@ struct System {
     }
     int64_t stride(int64_t i) const { return (i - work.head[i] + 1) * 6; }
 
-    // Poses that share a source keyframe meet in the system, no others.
-    void shape() {
+    // Poses that share a source keyframe meet in the system, and those of the band.
+    void shape(const Problem& p) {
         work.head.resize(n);
         work.row.resize(n);
         for (int64_t i = 0; i < n; ++i) work.head[i] = i;
@@ -46,6 +46,9 @@ struct System {
             each_member(s, [&](int64_t m) { first = std::min(first, m); });
             each_member(s, [&](int64_t m) { work.head[m] = std::min(work.head[m], first); });
         }
+        each_in_band(p, [&](int64_t i, int64_t j, const double*) {
+            work.head[i] = std::min(work.head[i], j);
+        });
         int64_t size = 0;
         for (int64_t i = 0; i < n; ++i) {
             work.row[i] = size;
@@ -95,6 +98,17 @@ struct System {
             }
             if (i >= 0) add_diagonal(i, ii);
         }
+    }
+
+    // What is known of the poses besides.
+    void add_band(const Problem& p) {
+        each_in_band(p, [&](int64_t i, int64_t j, const double* X) {
+            if (i == j) return add_diagonal(i, X);
+            for (int r = 0; r < 6; ++r)
+                for (int c = 0; c < 6; ++c) at(i, j)[r * stride(i) + c] += X[6 * r + c];
+        });
+        for (int64_t i = 0; p.reach >= 0 && i < n; ++i)
+            for (int q = 0; q < 6; ++q) work.g[6 * i + q] += p.band_rhs[6 * work.free[i] + q];
     }
 
     // diag <- diag (1 + lm) + ep, then L L^T in place; false if it is singular.
@@ -162,6 +176,15 @@ struct System {
     }
 
   private:
+    // f(i, j, block) of free poses i >= j.
+    template <class F>
+    void each_in_band(const Problem& p, F f) const {
+        for (int64_t i = 0; i < n; ++i)
+            for (int64_t m = 0; m <= std::min(p.reach, work.free[i]); ++m) {
+                const int64_t j = work.slot[work.free[i] - m];
+                if (j >= 0) f(i, j, p.band + (work.free[i] * (p.reach + 1) + m) * 36);
+            }
+    }
     template <class F>
     void each_member(const Source& s, F f) const {
         if (s.active == s.first) return;
