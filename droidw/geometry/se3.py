@@ -22,6 +22,7 @@ __all__ = [
     "from_matrix",
     "identity",
     "inv",
+    "left_jacobian_inverse",
     "log",
     "matrix",
     "mul",
@@ -85,14 +86,19 @@ def log(T: Tensor) -> Tensor:
     w_safe = torch.where(tiny, w, torch.ones_like(w))
     near = 2.0 / w_safe * (1.0 - n2 / (3.0 * w_safe * w_safe))
     phi = v * torch.where(tiny, near, 2.0 * torch.atan2(n, w) / n)
-    theta2 = (phi * phi).sum(-1, keepdim=True)
-    small = theta2 < _SERIES_BELOW
-    theta2_safe = torch.where(small, torch.ones_like(theta2), theta2)
-    half = 0.5 * theta2_safe.sqrt()
-    d = torch.where(small, _poly(theta2, _D_SERIES), (1.0 - half / half.tan()) / theta2_safe)
     cross = torch.linalg.cross(phi, t, dim=-1)
-    tau = t - 0.5 * cross + d * torch.linalg.cross(phi, cross, dim=-1)
+    tau = t - 0.5 * cross + _bend(phi) * torch.linalg.cross(phi, cross, dim=-1)
     return torch.cat((tau, phi), dim=-1)
+
+
+def left_jacobian_inverse(phi: Tensor) -> Tensor:
+    """Change [..., 3, 3] of the rotation vector phi [..., 3] of exp(phi) by a turn from the left.
+
+    `log(exp(d) exp(phi)) = phi + J d` to first order in d.
+    """
+    K = skew(phi)
+    eye = torch.eye(3, dtype=phi.dtype, device=phi.device)
+    return eye - 0.5 * K + _bend(phi)[..., None] * (K @ K)
 
 
 def mul(A: Tensor, B: Tensor) -> Tensor:
@@ -195,6 +201,15 @@ def _joint_shape(a: torch.Size, b: torch.Size) -> torch.Size:
     """Shape that two leading shapes broadcast to."""
     # torch.broadcast_shapes would do, but its first call imports sympy: 0.7 s.
     return torch.Size(np.broadcast_shapes(tuple(a), tuple(b)))
+
+
+def _bend(phi: Tensor) -> Tensor:
+    """(1 - theta/2 cot(theta/2)) / theta^2 of rotation vectors [..., 3], [..., 1]."""
+    theta2 = (phi * phi).sum(-1, keepdim=True)
+    small = theta2 < _SERIES_BELOW
+    safe = torch.where(small, torch.ones_like(theta2), theta2)
+    half = 0.5 * safe.sqrt()
+    return torch.where(small, _poly(theta2, _D_SERIES), (1.0 - half / half.tan()) / safe)
 
 
 def _poly(x: Tensor, coefficients: tuple[float, ...]) -> Tensor:

@@ -27,6 +27,8 @@ __all__ = ["Backend"]
 
 # Pairs whose distance is computed at once; bounds memory, not the result.
 _CHUNK = 2048
+# By how much less steady motion counts from pass to pass.
+_FADES = 3.0
 
 
 class Backend:
@@ -34,17 +36,23 @@ class Backend:
 
     Args:
         focal_known: the focal length is a calibration, not a guess.
+        motion_prior: how much steady motion counts in the first pass, as `backend.motion_prior`.
     Attributes:
         focal: what the search for a better focal length found, None without one.
         agreement: share of what was measured last that agrees with poses and depths; NaN before.
     """
 
     def __init__(
-        self, optimiser: Optimiser, config: DroidwConfig, focal_known: bool = True
+        self,
+        optimiser: Optimiser,
+        config: DroidwConfig,
+        focal_known: bool = True,
+        motion_prior: float = 0.0,
     ) -> None:
         self.optimiser = optimiser
         self.config = config
         self.focal_known = focal_known
+        self.motion_prior = motion_prior
         self.focal: FocalSearch | None = None
         self.agreement = float("nan")
 
@@ -64,7 +72,7 @@ class Backend:
         done = edges = 0
         wide = self._begins_wide()
         for number, updates in enumerate(options.passes):
-            solver = self._solver(number, wide)
+            solver, prior = self._solver(number, wide), self._prior(number)
             if options.normalize and not bool(store["prior"].any()):
                 mean = store.disps.mean()
                 store.disps.div_(mean)
@@ -79,7 +87,9 @@ class Backend:
                 if "droid-w" in self.config.compat:
                     # as published: enlarged before the bundle adjustment of the same step
                     shown = store.disps.clone()
-                self.optimiser.update(graph, session, phase, solver, first_free=1)
+                self.optimiser.update(
+                    graph, session, phase, solver, first_free=1, motion_prior=prior
+                )
                 done += 1
                 tell(done, total)
             edges = len(graph)
@@ -110,6 +120,11 @@ class Backend:
             wider = solver.cauchy * self.config.backend.wide_start
             return replace(solver, cauchy=wider, cauchy_tuning=0.0)
         return replace(solver, cauchy_tuning=0.0) if number == int(wide) < last else solver
+
+    def _prior(self, number: int) -> float:
+        """How much steady motion counts in one pass; measurements have the last word."""
+        last = number == len(self.config.backend.passes) - 1
+        return 0.0 if last else self.motion_prior / _FADES**number
 
     def _begins_wide(self) -> bool:
         """Whether the first pass has a wider kernel than those after it.

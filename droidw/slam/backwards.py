@@ -101,7 +101,7 @@ class _SecondLook:
         self._stopped = stopped
         self._done = 0
         options = config.backend
-        steps = (1 + int(options.relearn)) * sum(options.passes)
+        steps = (1 + int(options.relearn or options.motion_prior > 0)) * sum(options.passes)
         steps += int(options.splice) * sum(options.passes[-_SPLICE_PASSES:])
         self._total = len(optimiser.store) + steps
 
@@ -117,8 +117,8 @@ class _SecondLook:
             self.kept, self.share = back, 1.0
         if options.splice:
             self._splice(there if better else back)
-        if options.relearn and self.kept is not there:
-            self._relearn()
+        if self.kept is not there and (options.relearn or options.motion_prior > 0):
+            self._finish()
         self._events.emit(Progress("backwards", self._total, self._total))
 
     def _splice(self, other: Path) -> None:
@@ -146,14 +146,23 @@ class _SecondLook:
             part = sum(taken) / len(taken)
             self.kept, self.share = found, abs(self.share - part)
 
-    def _relearn(self) -> None:
-        """Let uncertainty learn from the path that is kept, and the path adjust to that."""
+    def _finish(self) -> None:
+        """Adjust the path that is kept to how cameras move, while uncertainty learns from it.
+
+        Where little of what stands still is seen, matches agree with whatever path they were
+        searched around; there is then more sense in a camera that moves as it did before.
+        """
+        options = self.config.backend
         # What agrees with new weights is nothing to compare with what agreed before.
         agreement = self.kept.agreement
-        found = self._adjusted(self.kept, self.config.backend.passes, learn=True)
+        found = self._adjusted(
+            self.kept, options.passes, learn=options.relearn, motion_prior=options.motion_prior
+        )
         self.kept = replace(found, agreement=agreement)
 
-    def _adjusted(self, path: Path, passes: list[int], learn: bool) -> Path:
+    def _adjusted(
+        self, path: Path, passes: list[int], learn: bool, motion_prior: float = 0.0
+    ) -> Path:
         """A path after passes of global adjustment."""
         path.write_to(self.optimiser.store)
         before = self._done
@@ -165,7 +174,7 @@ class _SecondLook:
             backend=replace(self.config.backend, passes=passes, wide_start=1.0),
             camera=replace(self.config.camera, refine_focal=False),
         )
-        backend = Backend(self.optimiser, config)
+        backend = Backend(self.optimiser, config, motion_prior=motion_prior)
         backend.run(lambda done, _: self._tell(before + done, self._total))
         return Path.of(self.optimiser.store, backend.agreement)
 

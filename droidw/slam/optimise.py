@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,7 +14,8 @@ from droidw.geometry.projective import reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.interfaces.uncertainty import Indices, UncertaintyView
-from droidw.solve.kernel import redescended
+from droidw.solve.kernel import redescended, usual_square
+from droidw.solve.motion import steady_motion
 from droidw.solve.problem import BAProblem, Report
 from droidw.solve.weights import gate, residual_weights
 
@@ -159,6 +160,7 @@ class Optimiser:
         first_free: int,
         reach: int = 3,
         informed: bool = True,
+        motion_prior: float = 0.0,
     ) -> None:
         """One update step over the active edges, with retired ones near the window in BA.
 
@@ -168,12 +170,13 @@ class Optimiser:
             first_free: poses before this keyframe are held.
             reach: retired edges take part if both ends are at `first_free - reach` or later.
             informed: whether correspondence may search around what geometry predicts.
+            motion_prior: how much steady motion counts, as `backend.motion_prior`.
         """
         active = graph.select()
         self.measure(graph, session, active, informed, learned=phase.weigh)
         low = max(0, first_free - reach)
         retired = [r for r in graph.select(active=False) if min(graph.ii[r], graph.jj[r]) >= low]
-        self.adjust(graph, sorted(active + retired), phase, solver, first_free)
+        self.adjust(graph, sorted(active + retired), phase, solver, first_free, motion_prior)
         graph.grow_older(active)
 
     def adjust(
@@ -183,6 +186,7 @@ class Optimiser:
         phase: PhaseConfig,
         solver: SolverConfig,
         first_free: int,
+        motion_prior: float = 0.0,
     ) -> None:
         """Gauss-Newton iterations on these edges, each followed by an uncertainty update."""
         if not rows:
@@ -197,7 +201,7 @@ class Optimiser:
         confidence = graph.confidence if everything else graph.confidence[at]
         for _ in range(phase.iterations):
             with self.clock("bundle"):
-                self._step(used, target, confidence, phase, solver, first_free)
+                self._step(used, target, confidence, phase, solver, first_free, motion_prior)
             if phase.learn:
                 with self.clock("uncertainty"):
                     self._learn(ii, jj, pairs, target, confidence, first_free)
@@ -210,6 +214,7 @@ class Optimiser:
         phase: PhaseConfig,
         solver: SolverConfig,
         first_free: int,
+        motion_prior: float,
     ) -> None:
         """One Gauss-Newton step on the part of the store that the edges touch."""
         store, weighting = self.store, self.weighting
@@ -247,6 +252,10 @@ class Optimiser:
             max_disp=weighting.max_disp or None,
             pairs=edges.pairs,
         )
+        if motion_prior > 0:
+            times = torch.tensor(store.times()[low:], dtype=torch.float64)
+            known = motion_prior * usual_square(problem)
+            problem = replace(problem, pose_term=steady_motion(problem.T_cw, times, known))
         step = self.parts.ba.step(redescended(problem, solver))
         self._note(step.report)
         self.cost = step.report.cost_before

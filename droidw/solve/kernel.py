@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from droidw.config.schema import SolverConfig
     from droidw.solve.problem import BAProblem
 
-__all__ = ["median_length", "redescend", "redescended"]
+__all__ = ["median_length", "redescend", "redescended", "usual_square"]
 
 # Bins of squared residual lengths: 32 to an octave, 1.1 per cent of a length each.
 _PER_OCTAVE = 32
@@ -99,8 +99,7 @@ def redescended(
     """
     if solver.cauchy == 0:
         return problem
-    coords, _ = reproject(problem.T_cw, problem.disps, problem.intrinsics, problem.ii, problem.jj)
-    residual = problem.target - coords
+    residual = _residual(problem)
     widest = float(solver.cauchy)
     width: float | Tensor = widest
     if solver.cauchy_tuning > 0:
@@ -109,6 +108,17 @@ def redescended(
         width = width.expand(len(residual)) if group is None else width[group]
     weight = redescend(problem.weight, residual, width, solver.cauchy_slip)
     return replace(problem, weight=weight)
+
+
+def usual_square(problem: BAProblem) -> float:
+    """Square of `median_length` of all matches at the poses and depths of the problem, cells^2."""
+    return float(median_length(problem.weight, _residual(problem)).square())
+
+
+def _residual(problem: BAProblem) -> Tensor:
+    """Measured less predicted positions, [E,h,w,2] cells."""
+    coords, _ = reproject(problem.T_cw, problem.disps, problem.intrinsics, problem.ii, problem.jj)
+    return problem.target - coords
 
 
 def _mean(weight: Tensor) -> Tensor:

@@ -47,12 +47,22 @@ def broken(arc, waves, stored):
         target = torch.where(wrong[..., None], measured(ii, jj, start)[0], target)
         return EdgeUpdate(target, valid[..., None].float().expand_as(target).contiguous())
 
-    def call(cauchy=0.75, focal=False, **backend):
+    def blind(request):
+        # some noise, and nothing at all across the break
+        found = answer(request)
+        ii, jj = torch.tensor(request.ii), torch.tensor(request.jj)
+        noise = torch.randn(found.target.shape, generator=torch.Generator().manual_seed(1))
+        seen = ((ii < BROKEN) == (jj < BROKEN))[:, None, None, None]
+        return EdgeUpdate(found.target + 0.02 * noise, found.confidence * seen)
+
+    def call(cauchy=0.75, focal=False, joined=True, **backend):
         config = DroidwConfig(camera=CameraConfig(refine_focal=focal))
         config.global_solver.cauchy = cauchy
         config.backend = replace(config.backend, **backend)
         store = stored(grid, intrinsics.clone(), start, disps)
-        operator = SimpleNamespace(session=lambda purpose: SimpleNamespace(update=answer))
+        operator = SimpleNamespace(
+            session=lambda purpose: SimpleNamespace(update=answer if joined else blind)
+        )
         parts = Parts(None, None, None, TorchBundleAdjuster(), operator)
         optimiser = Optimiser(store, parts, config.weighting, Stopwatch())
 
@@ -93,6 +103,35 @@ def test_one_pass_and_no_kernel_are_as_they_were(broken, options):
         run(backend)
         poses.append(backend.optimiser.store.T_cw.clone())
     assert torch.equal(*poses)
+
+
+@pytest.mark.parametrize(
+    ("passes", "expected"),
+    [([2, 1, 1], [90.0, 90.0, 30.0, 0.0]), ([1, 1], [90.0, 0.0]), ([2], [0.0, 0.0])],
+)
+def test_steady_motion_counts_less_in_each_pass_and_nothing_in_the_last(
+    broken, monkeypatch, passes, expected
+):
+    backend, _ = broken(passes=passes)
+    backend.motion_prior = 90.0
+    heard = []
+    monkeypatch.setattr(
+        backend.optimiser, "update", lambda *given, motion_prior, **more: heard.append(motion_prior)
+    )
+    run(backend)
+    assert heard == expected
+
+
+def test_steady_motion_joins_what_no_match_joins(broken):
+    left = []
+    for prior in (0.0, 100.0):
+        backend, residual = broken(passes=[6, 6, 6, 1], joined=False)
+        backend.motion_prior = prior
+        before = residual()
+        run(backend)
+        left.append(residual() / before)
+    assert left[0] > 0.8
+    assert left[1] < 0.1
 
 
 @pytest.mark.parametrize(

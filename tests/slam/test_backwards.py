@@ -145,10 +145,12 @@ class Settled:
     Attributes:
         learned: for each further global adjustment, whether uncertainty was to learn.
         passes: of each of these, all without the wide kernel.
+        priors: how much steady motion counted in each of these.
     """
 
     def __init__(self, optimiser, config, monkeypatch, found, agreement=0.5, **more):
         self.asked, self.learned, self.passes, self.compared = 0, [], [], 0
+        self.priors = []
         self.more = {"piece": (), "holds": True, "adjusted": 0.7} | more
         self.found = bent(optimiser.store, found) if isinstance(found, float) else found
         monkeypatch.setattr(module, "track_backwards", self.track)
@@ -178,6 +180,7 @@ class Settled:
         assert backend.config.backend.wide_start == 1.0
         self.passes.append(backend.config.backend.passes)
         self.learned.append(backend.config.schedule["global"].learn)
+        self.priors.append(backend.motion_prior)
         if isinstance(self.more["adjusted"], Exception):
             raise self.more["adjusted"]
         for done in (1, 2):
@@ -212,6 +215,8 @@ def test_pieces_of_the_way_that_agrees_less_are_taken(optimiser, config, monkeyp
     assert (made.kept.agreement, made.kept.backwards) == (0.7, pytest.approx(share))
     assert made.learned == [False, True]
     assert made.passes == [[2, 3], [1, 2, 3]]
+    # what was taken for its matches is not to be drawn to a steady path before it is weighed
+    assert made.priors == [0.0, config.backend.motion_prior]
 
 
 def test_pieces_that_global_adjustment_leaves_are_not_kept(optimiser, config, monkeypatch):
@@ -222,8 +227,19 @@ def test_pieces_that_global_adjustment_leaves_are_not_kept(optimiser, config, mo
     assert made.learned == [False]
 
 
-def test_no_pieces_and_no_learning_if_not_asked_for(optimiser, config, monkeypatch):
+@pytest.mark.parametrize(("learn", "prior"), [(True, 0.0), (False, 30.0), (True, 30.0)])
+def test_learning_and_steady_motion_share_one_adjustment(
+    optimiser, config, monkeypatch, learn, prior
+):
+    config.backend.relearn, config.backend.motion_prior = learn, prior
+    made = Settled(optimiser, config, monkeypatch, 0.6)
+    assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
+    assert (made.learned, made.priors) == ([learn], [prior])
+
+
+def test_nothing_is_done_that_is_not_asked_for(optimiser, config, monkeypatch):
     config.backend.splice = config.backend.relearn = False
+    config.backend.motion_prior = 0.0
     made = Settled(optimiser, config, monkeypatch, 0.6, piece=range(3, 7))
     assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
     assert made.learned == []
@@ -264,6 +280,7 @@ def test_only_doubt_asks_for_it(optimiser, config, monkeypatch, below, agreement
 def test_it_is_told_how_far_it_is(optimiser, config, splice):
     heard = Heard()
     config.backend.relearn, config.backend.splice = False, splice
+    config.backend.motion_prior = 0.0
     diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=0.5)
     doubted(optimiser, config, diagnosis, Dispatcher([("heard", heard)]), lambda: False)
     told = [(event.done, event.total) for event in heard.events]
