@@ -211,9 +211,9 @@ class BackendConfig:
     relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
     motion_prior: float = opt(
         100.0,
-        "how much steady motion counts for what was kept of the way back: in a first pass, a change "
-        "of velocity that is usual for the path as much as so many matches with a usual residual; "
-        "in each pass after it a third of that, in the last one nothing",
+        "how much steady motion counts for what was kept of the way back: in a first pass, a "
+        "change of velocity that is usual for the path as much as so many matches with a usual "
+        "residual; in each pass after it a third of that, in the last one nothing",
         ge=0,
     )
 

@@ -22,7 +22,7 @@ def path(n=12, seed=0, rough=0.1):
 
 
 def jumps(T, times, speed=None):
-    """Changes of velocity, as a share of the speed, and of turning rate, over root time, [N-2,6]."""
+    """Changes of velocity, as a share of the speed, and of turning rate, by root time, [N-2,6]."""
     dt = times[1:] - times[:-1]
     centres = se3.inv(T)[:, :3]
     velocity = (centres[1:] - centres[:-1]) / dt[:, None]
@@ -123,7 +123,7 @@ def test_scale_and_direction_of_time_change_nothing():
     back = steady_motion(T.flip(0), -times.flip(0), 1.0)
     falling = steady_motion(T.flip(0), times.flip(0), 1.0)
     torch.testing.assert_close(back.rhs, falling.rhs)
-    # nothing but the choice of the first camera, which fixes what a change of scale is, depends on it
+    # but for the choice of the first camera, which fixes what a change of scale is
     torch.testing.assert_close(back.band[:, 0].flip(0), here.band[:, 0])
 
 
