@@ -147,10 +147,10 @@ class _SecondLook:
             self.kept, self.share = found, abs(self.share - part)
 
     def _finish(self) -> None:
-        """Adjust the path that is kept to how cameras move, while uncertainty learns from it.
+        """Adjust the path that is kept while uncertainty learns from it and steady motion counts.
 
         Where little of what stands still is seen, matches agree with whatever path they were
-        searched around; there is then more sense in a camera that moves as it did before.
+        searched around, and that a camera moves steadily is all that is known.
         """
         options = self.config.backend
         # What agrees with new weights is nothing to compare with what agreed before.
