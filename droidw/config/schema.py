@@ -301,7 +301,7 @@ class DroidwConfig:
             "init_again": PhaseConfig(updates=0),
             "window": PhaseConfig(updates=1),
             "window_kept": PhaseConfig(updates=1),
-            "global": PhaseConfig(updates=0, iterations=4, learn=False, depth_prior=False),
+            "global": PhaseConfig(updates=0, iterations=8, learn=False, depth_prior=False),
             "fill": PhaseConfig(updates=0, iterations=8, learn=False, depth_prior=False),
         },
         metadata={
