@@ -17,6 +17,8 @@ FLOW = (
     "cpu",
     "features={name: fit3d, options: {precision: float32}}",
     "depth={name: metric3d, options: {variant: vit-small, size: [56, 84], precision: float32}}",
+    # each step lets the rounding of a path without parallax grow
+    "schedule.global.iterations=4",
 )
 DROID = ("--preset", "droid-slam", "correspondence.options={precision: float32, store: float}",
          "uncertainty=affine-softplus", "features=fit3d", "frontend.predict=velocity")  # fmt: skip
