@@ -49,6 +49,17 @@ def energy(T, times, spread):
     return 27 * torch.log1p(lengths(jumps(T, times) / spread) / 9).sum()
 
 
+def dense(term):
+    """The matrix [6N,6N] of a term."""
+    n = len(term.band)
+    H = torch.zeros(n, 6, n, 6, dtype=torch.float64)
+    for k in range(n):
+        for m in range(min(3, k + 1)):
+            H[k, :, k - m] = term.band[k, m]
+            H[k - m, :, k] = term.band[k, m].T
+    return H.view(6 * n, 6 * n)
+
+
 def test_gradient_and_curvature_are_those_of_the_energy():
     T, times = path()
     spread = usual(T, times)
@@ -66,14 +77,8 @@ def test_gradient_and_curvature_are_those_of_the_energy():
     e = e.flatten()
     term = steady_motion(T, times, 0.7)
     n = len(T)
-    H = torch.zeros(n, 6, n, 6, dtype=torch.float64)
-    for k in range(n):
-        for m in range(min(3, k + 1)):
-            H[k, :, k - m] = term.band[k, m]
-            H[k - m, :, k] = term.band[k, m].T
-    torch.testing.assert_close(
-        H.view(6 * n, 6 * n), 0.7 * J.T @ (kept[:, None] * J), atol=1e-8, rtol=1e-8
-    )
+    H = dense(term)
+    torch.testing.assert_close(H, 0.7 * J.T @ (kept[:, None] * J), atol=1e-8, rtol=1e-8)
     # all of the gradient but what is a change of scale
     expected = (-0.7 * J.T @ (kept * e)).view(n, 6)
     missing = expected - term.rhs
@@ -94,12 +99,8 @@ def test_steps_make_a_path_steadier_without_shrinking_it():
     for _ in range(10):
         term = steady_motion(T, times, 1.0)
         n = len(T)
-        H = torch.zeros(n, 6, n, 6, dtype=torch.float64)
-        for k in range(n):
-            for m in range(min(3, k + 1)):
-                H[k, :, k - m] = term.band[k, m]
-                H[k - m, :, k] = term.band[k, m].T
-        H = H.view(6 * n, 6 * n) + 1e3 * torch.eye(6 * n, dtype=torch.float64)
+        H = dense(term)
+        H = H + 1e3 * torch.eye(6 * n, dtype=torch.float64)
         x = torch.linalg.solve(H, term.rhs.view(-1)).view(n, 6)
         assert float(term.energy(x)) < 0
         T = se3.retract(T, x)
