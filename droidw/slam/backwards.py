@@ -101,7 +101,8 @@ class _SecondLook:
         self._stopped = stopped
         self._done = 0
         options = config.backend
-        steps = (1 + int(options.relearn or options.motion_prior > 0)) * sum(options.passes)
+        self._finishes = options.relearn or options.motion_prior > 0
+        steps = (1 + int(self._finishes)) * sum(options.passes)
         steps += int(options.splice) * sum(options.passes[-_SPLICE_PASSES:])
         self._total = len(optimiser.store) + steps
 
@@ -117,7 +118,7 @@ class _SecondLook:
             self.kept, self.share = back, 1.0
         if options.splice:
             self._splice(there if better else back)
-        if self.kept is not there and (options.relearn or options.motion_prior > 0):
+        if self._finishes and self.kept is not there:
             self._finish()
         self._events.emit(Progress("backwards", self._total, self._total))
 
