@@ -9,7 +9,13 @@ import torch
 from droidw.geometry.camera import Grid
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw_plugins.correspondence import flow
-from droidw_plugins.correspondence._flow_information import information, structure, trust, turned
+from droidw_plugins.correspondence._flow_information import (
+    information,
+    likeness,
+    structure,
+    trust,
+    turned,
+)
 from droidw_plugins.correspondence._flow_types import FlowFrame
 
 HEIGHT, WIDTH, STRIDE = 160, 208, 8
@@ -162,8 +168,11 @@ def pulled(matrix):
 
 
 def some_frame(degrees):
+    return frame_of(stripes(degrees))
+
+
+def frame_of(grey):
     centres = GRID.centres().numpy().astype(np.float32)
-    grey = stripes(degrees)
     return FlowFrame(0, grey.astype(np.uint8), *structure(grey, centres, STRIDE), centres, STRIDE)
 
 
@@ -193,6 +202,49 @@ def test_what_is_no_longer_like_the_line_keeps_its_normal(times):
         turned(payload, pulled([[0, -1], [1, 0]]), 8)[INNER], payload.normal[INNER]
     )
     assert turned(payload, pulled([[1, 0.2], [0, 1]]), 0) is payload.normal
+
+
+PIXELS = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).astype(np.float32)
+
+
+def alike(first, second, flow_there, error=0.7):
+    """Median of what `likeness` says inside the picture."""
+    there = np.broadcast_to(np.float32(flow_there), PIXELS.shape)
+    found = likeness(frame_of(first), frame_of(second), there, PIXELS, error)
+    assert found.dtype == np.float32 and (found >= 0).all() and (found <= 1).all()
+    return float(np.median(found[INNER]))
+
+
+@pytest.mark.parametrize("error", [0.7, 1.5])
+@pytest.mark.parametrize("degrees", ANGLES)
+def test_a_match_is_alike_by_less_the_further_it_is_off_across_a_line(degrees, error):
+    # so narrow that no difference is common to the whole window
+    before, after = (stripes(degrees, shift, (11.0, 13.0)) for shift in ((0.0, 0.0), (2.0, 1.0)))
+    n = np.deg2rad(degrees)
+    across, along_it = np.array([np.cos(n), np.sin(n)]), np.array([-np.sin(n), np.cos(n)])
+    right = np.array([2.0, 1.0])
+    assert alike(before, after, right, error) == 1.0
+    assert alike(before, after, right + 5 * along_it, error) == 1.0
+    assert alike(before, after, right + 0.95 * across, error) == 1.0
+    half = np.hypot(1.0, error)
+    assert alike(before, after, right + half * across, error) == pytest.approx(0.5, abs=0.1)
+    assert alike(before, after, right + 2.5 * half * across, error) < 0.25
+
+
+def test_a_brighter_picture_and_a_blank_one_are_alike():
+    assert alike(blobs(), blobs() + 20, (0.0, 0.0)) > 0.98
+    blank = np.full((HEIGHT, WIDTH), 90.0, dtype=np.float32)
+    assert alike(blank, blank, (7.0, -3.0)) == 1.0
+
+
+def test_what_does_not_look_alike_is_not_trusted(measured):
+    """Two pictures without anything in common: some matches come back by chance."""
+    other = blobs()[::-1, ::-1].copy()
+    trusting, strict = (
+        float(measured(blobs(), other, likeness=s)[1][..., :2].mean()) for s in (0.0, 0.7)
+    )
+    assert trusting > 0.1
+    assert strict < 0.5 * trusting
 
 
 def test_information_is_the_sum_of_both_directions():

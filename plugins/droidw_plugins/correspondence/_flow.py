@@ -16,6 +16,7 @@ import numpy as np
 from droidw.interfaces.correspondence import Motion, Purpose
 from droidw_plugins.correspondence._flow_information import (
     information,
+    likeness,
     sample,
     structure,
     trust,
@@ -55,6 +56,7 @@ class FlowCorrespondence:
         self.offset = (options.stride - 1) / 2
         self._track: Track | None = None
         self._placed: tuple[tuple[int, int], Any, Any] | None = None
+        self._raster: Array | None = None
         workers = options.workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
         self._local = threading.local()
@@ -226,13 +228,16 @@ class FlowCorrespondence:
         ):
             return replace(known[0]), replace(known[1])
         ab, ba = self._started(a, b, start_ab, fine), self._started(b, a, start_ba, fine)
-        both = self._checked(c, ab, ba, start_ab), self._checked(d, ba, ab, start_ba)
+        both = (
+            self._checked(c, (a, b), ab, ba, start_ab),
+            self._checked(d, (b, a), ba, ab, start_ba),
+        )
         if again:
             ab, ba = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
             share = self.options.bridged_share
             both = (
-                surer(both[0], self._checked(c, ab, ba, start_ab), c.bridged, share),
-                surer(both[1], self._checked(d, ba, ab, start_ba), d.bridged, share),
+                surer(both[0], self._checked(c, (c, d), ab, ba, start_ab), c.bridged, share),
+                surer(both[1], self._checked(d, (d, c), ba, ab, start_ba), d.bridged, share),
             )
         with self._lock:
             self._pairs[key] = both
@@ -271,13 +276,32 @@ class FlowCorrespondence:
             self._placed = ((height, width), *np.meshgrid(cols, rows))
         return self._placed[1], self._placed[2]
 
-    def _checked(self, a: FlowFrame, ab: Array, ba: Array, started: Array | None) -> Edge:
+    def _pixels(self, height: int, width: int) -> Array:
+        """Coordinates x, y of all pixels, [H,W,2]."""
+        if self._raster is None or self._raster.shape[:2] != (height, width):
+            x, y = np.meshgrid(np.arange(width), np.arange(height))
+            self._raster = np.stack([x, y], -1).astype(np.float32)
+        return self._raster
+
+    def _checked(
+        self,
+        a: FlowFrame,
+        searched: tuple[FlowFrame, FlowFrame],
+        ab: Array,
+        ba: Array,
+        started: Array | None,
+    ) -> Edge:
+        """Edge from `a`, whose flow there and back was `searched` between these pictures."""
         moved = sample(ab, a.centres)
         there = a.centres + moved
         back = sample(ba, there, outside=1e4)
-        agreed = trust(moved + back, a.normal, self.options)
+        across, along = trust(moved + back, a.normal, self.options)
+        if self.options.likeness > 0:
+            pixels = self._pixels(*a.grey.shape)
+            alike = likeness(*searched, ab, pixels, self.options.likeness)
+            across, along = across * alike, along * alike
         normal = turned(a, ab, self.options.turn_reach)
-        confidence = information(a, *agreed, self.options, normal)
+        confidence = information(a, across, along, self.options, normal)
         target = ((there - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, started)
 

@@ -14,12 +14,16 @@ if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow_types import FlowFrame
     from droidw_plugins.correspondence.flow import FlowOptions
 
-__all__ = ["information", "sample", "structure", "trust", "turned"]
+__all__ = ["information", "likeness", "sample", "structure", "trust", "turned"]
 
 # Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
 _FLAT = 0.1
 # Keeps the power of a flat window from being divided by itself.
 _NOTHING = np.float32(1e-12)
+# Mean square difference of a match without any error, grey levels^2: noise and rounding.
+_NOISE = 2.0
+# Square of the error of position, pixels^2, that good matches leave across an edge of depth.
+_COMMON = 1.0
 # How much longer a piece of line may become, and how far it may turn (cosine), to be the same line.
 _LONGER = 2.0
 _TURNED = 0.7
@@ -93,6 +97,34 @@ def trust(apart: Array, normal: Array, options: FlowOptions) -> tuple[Array, Arr
     second = 1.0 / (1.0 + error2 / options.consistency**2)
     second[error2 > options.cutoff**2] = 0.0
     return first.astype(np.float32), second.astype(np.float32)
+
+
+def likeness(a: FlowFrame, b: FlowFrame, flow: Array, pixels: Array, error: float) -> Array:
+    """How far the neighbourhood of each cell looks alike at both ends of a flow, [h,w] in [0,1].
+
+    A search both ways that sets out from the same wrong geometry comes back to where it began. What
+    is left of the difference in brightness betrays it: divided by the power of the picture it is
+    the square of an error e of position, to first order. A pixel is no reproach, and beyond it the
+    share is `1 / (1 + (e^2 - 1) / error^2)`. A difference that the whole window has does not count.
+
+    Args:
+        a, b: frames; what was searched is `a.grey` in `b.grey`.
+        flow: [H,W,2] pixels. pixels: [H,W,2] coordinates x, y of the pixels.
+        error: pixels.
+    """
+    place = pixels + flow
+    there = cv2.remap(
+        b.grey, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    apart: Any = cv2.subtract(a.grey, there, dtype=cv2.CV_32F)
+    window = (2 * a.stride - 1, 2 * a.stride - 1)
+    mean, square = (
+        sample(cv2.blur(p, window, borderType=cv2.BORDER_REPLICATE), a.centres)
+        for p in (apart, apart * apart)
+    )
+    left = np.maximum(square - mean * mean - _NOISE, 0.0) / (a.power.sum(axis=-1) + _FLAT)
+    share: Array = 1.0 / (1.0 + np.maximum(left - _COMMON, 0.0) / error**2)
+    return share.astype(np.float32)
 
 
 def turned(frame: FlowFrame, flow: Array, reach: int) -> Array:

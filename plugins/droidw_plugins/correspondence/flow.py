@@ -64,6 +64,15 @@ class FlowOptions:
             "gt": 0.0,
         },
     )
+    likeness: float = field(
+        default=0.7,
+        metadata={
+            "help": "how fast confidence falls where a match leaves more difference in brightness "
+            "than an error of position by a pixel would: e pixels leave "
+            "1 / (1 + (e^2 - 1) / likeness^2) of it (0: not asked)",
+            "ge": 0.0,
+        },
+    )
     texture: float = field(
         default=2.0,
         metadata={
