@@ -197,7 +197,7 @@ class BackendConfig:
     )
     factors_per_keyframe: int = opt(10, "directed edges per keyframe at most", ge=2)
     backwards_below: float = opt(
-        0.71,
+        0.72,
         "agreement of all matches with poses and depths below which keyframes are tracked once "
         "more, from the last to the first, and that is kept if more agrees (0: never, 1: however "
         "much agrees)",
