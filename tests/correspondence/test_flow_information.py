@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from droidw.geometry.camera import Grid
+from droidw.geometry.projective import pixel_grid
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw_plugins.correspondence import flow
 from droidw_plugins.correspondence._flow_information import (
@@ -204,7 +205,7 @@ def test_what_is_no_longer_like_the_line_keeps_its_normal(times):
     assert turned(payload, pulled([[1, 0.2], [0, 1]]), 0) is payload.normal
 
 
-PIXELS = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), -1).astype(np.float32)
+PIXELS = pixel_grid(HEIGHT, WIDTH).numpy()
 
 
 def alike(first, second, flow_there, error=0.7):

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from droidw.geometry.projective import pixel_grid
 from droidw.interfaces.correspondence import Motion, Purpose
 from droidw_plugins.correspondence._flow_information import (
     information,
@@ -279,8 +280,7 @@ class FlowCorrespondence:
     def _pixels(self, height: int, width: int) -> Array:
         """Coordinates x, y of all pixels, [H,W,2]."""
         if self._raster is None or self._raster.shape[:2] != (height, width):
-            x, y = np.meshgrid(np.arange(width), np.arange(height))
-            self._raster = np.stack([x, y], -1).astype(np.float32)
+            self._raster = pixel_grid(height, width).numpy()
         return self._raster
 
     def _checked(

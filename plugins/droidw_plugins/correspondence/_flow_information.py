@@ -112,11 +112,7 @@ def likeness(a: FlowFrame, b: FlowFrame, flow: Array, pixels: Array, error: floa
         flow: [H,W,2] pixels. pixels: [H,W,2] coordinates x, y of the pixels.
         error: pixels.
     """
-    place = pixels + flow
-    there = cv2.remap(
-        b.grey, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
-    apart: Any = cv2.subtract(a.grey, there, dtype=cv2.CV_32F)
+    apart = a.grey - sample(b.grey, pixels + flow)
     window = (2 * a.stride - 1, 2 * a.stride - 1)
     mean, square = (
         sample(cv2.blur(p, window, borderType=cv2.BORDER_REPLICATE), a.centres)
