@@ -46,6 +46,8 @@ class EdgeRequest:
         informed: whether poses and depths are good enough to search around `coords`.
         gates: node numbers -> [n,h,w] in [0,1], what learned uncertainty leaves of their cells;
             None where it is not known or not to be used.
+        doubtful: whether a path is tracked again because too little of what was measured agreed
+            with it: worth a search that takes longer and relies less on the prediction.
     """
 
     ids: list[int]
@@ -56,6 +58,7 @@ class EdgeRequest:
     payload: Callable[[int], Any]
     informed: bool = True
     gates: Callable[[Sequence[int]], Tensor] | None = None
+    doubtful: bool = False
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,7 @@ def doubted(
         100 * agreement,
     )
     look = _SecondLook(optimiser, config, agreement, events, stopped)
+    optimiser.doubtful = True
     try:
         with optimiser.clock("backwards"):
             look.run()
@@ -73,6 +74,8 @@ def doubted(
     except Exception as error:  # noqa: BLE001 - what was found forwards is as good as it was
         why = str(error) or type(error).__name__
         events.warn(f"tracking the keyframes backwards broke off, the best so far is kept: {why}")
+    finally:
+        optimiser.doubtful = False
     look.kept.write_to(optimiser.store)
     return replace(found, agreement=look.kept.agreement, backwards=look.share)
 

@@ -67,6 +67,7 @@ class Optimiser:
         published: similarities are the raw cosine, whatever `weighting` says.
     Attributes:
         begins: uncertainty is to be told what can move before the first search. begun: it was.
+        doubtful: correspondence is asked on behalf of a path that is in doubt.
     """
 
     def __init__(
@@ -91,6 +92,7 @@ class Optimiser:
             parts.features, "movable"
         )
         self.begun = False
+        self.doubtful = False
         self.iterations = 0
         self.reports: dict[str, int] = {}
         self.cost = float("nan")
@@ -99,6 +101,7 @@ class Optimiser:
         """The same for another store, whose uncertainty begins with what this one has learned."""
         other = Optimiser(store, self.parts, self.weighting, self.clock, self._published)
         other.begun = self.begun
+        other.doubtful = self.doubtful
         return other
 
     def add_reports(self, other: Optimiser) -> None:
@@ -143,6 +146,7 @@ class Optimiser:
             payload=store.payload,
             informed=informed,
             gates=self.learned_gates if learned and (informed or self.begun) else None,
+            doubtful=self.doubtful,
         )
         with self.clock("correspondence"):
             answer = session.update(request)

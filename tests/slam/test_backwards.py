@@ -276,6 +276,21 @@ def test_only_doubt_asks_for_it(optimiser, config, monkeypatch, below, agreement
     assert Settled(optimiser, config, monkeypatch, None, agreement).asked == asked
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_correspondence_is_told_of_the_doubt_while_it_lasts(optimiser, config, monkeypatch, fails):
+    asked = []
+    session = optimiser.parts.correspondence.session("window")
+    monkeypatch.setattr(
+        session, "update", lambda r, update=session.update: asked.append(r.doubtful) or update(r)
+    )
+    if fails:
+        monkeypatch.setattr(module._SecondLook, "_finish", lambda self: 1 / 0)
+    diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=0.5)
+    doubted(optimiser, config, diagnosis, Dispatcher(), lambda: False)
+    assert asked and all(asked)
+    assert not optimiser.doubtful
+
+
 @pytest.mark.parametrize("splice", [True, False])
 def test_it_is_told_how_far_it_is(optimiser, config, splice):
     heard = Heard()

@@ -25,6 +25,7 @@ from droidw_plugins.correspondence._flow_information import (
 )
 from droidw_plugins.correspondence._flow_mask import grown, surer, without
 from droidw_plugins.correspondence._flow_polish import polished
+from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Track
 
@@ -44,6 +45,12 @@ _GRID_FIELDS = 20_000
 # Median distance of two starts, in cells, that lead to the same result: a search goes on from the
 # coarsest level, where a pixel is little.
 _SAME_START = 0.15
+# Pixels between a seed and the flow that was found for which a search sets out from the seeds; the
+# coarsest level of that search, on which a pixel is four, and how many times as sure a match of it
+# has to be.
+_SEEDED = 1.5
+_NEAR_SCALE = 2
+_CLEARLY = 1.05
 # Checked pairs kept for the next session that asks for them: some forty kilobytes each.
 _PAIRS = 4_000
 
@@ -65,6 +72,7 @@ class FlowCorrespondence:
         self._latest: tuple[_Pair, Array] | None = None
         self._full: OrderedDict[_Pair, Array] = OrderedDict()
         self._grid: OrderedDict[_Pair, Array] = OrderedDict()
+        self._seeds = SeedBook(options.seeds)
         self._pairs: OrderedDict[tuple[Hashable, ...], tuple[Edge, Edge]] = OrderedDict()
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
@@ -129,15 +137,21 @@ class FlowCorrespondence:
         return Motion(float(length.mean()) / self.stride, matched)
 
     def _search(
-        self, a: FlowFrame, b: FlowFrame, start: Array | None = None, fine: bool = False
+        self,
+        a: FlowFrame,
+        b: FlowFrame,
+        start: Array | None = None,
+        fine: bool = False,
+        near: bool = False,
     ) -> Array:
-        """Dense flow a -> b, [H,W,2] pixels; `fine` as for global adjustment."""
+        """Dense flow a -> b, [H,W,2] pixels; `fine` as for global adjustment, `near` the start."""
         # An engine remembers that it was once given a start, and answers differently ever after:
         # one for each use, or the result would depend on which thread did what before.
         options = self.options
         scale = options.global_scale if fine else options.finest_scale
         refinement = options.global_refinement if fine else options.refinement
-        name = f"{'free' if start is None else 'started'}-{scale}-{refinement}"
+        kind = "free" if start is None else "near" if near else "started"
+        name = f"{kind}-{scale}-{refinement}"
         engine: Any = getattr(self._local, name, None)
         if engine is None:
             engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
@@ -146,6 +160,9 @@ class FlowCorrespondence:
             engine.setVariationalRefinementIterations(refinement)
             engine.setPatchSize(options.patch_size)
             engine.setPatchStride(options.patch_stride)
+            room = min(a.grey.shape) >> _NEAR_SCALE >= 2 * options.patch_size
+            if near and room and hasattr(engine, "setCoarsestScale"):  # OpenCV from 4.13 on
+                engine.setCoarsestScale(max(scale, _NEAR_SCALE))
             setattr(self._local, name, engine)
         flow: Array = engine.calc(a.grey, b.grey, None if start is None else start.copy())
         return flow
@@ -207,6 +224,7 @@ class FlowCorrespondence:
         fine: bool = False,
         *,
         bridged: tuple[FlowFrame, FlowFrame],
+        seeded: bool = False,
     ) -> tuple[Edge, Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
@@ -217,10 +235,11 @@ class FlowCorrespondence:
             fine: as for global adjustment.
             bridged: the frames without what moves, or themselves; what a second search finds
                 between these is taken where it is surer.
+            seeded: whether another search sets out from points matched by their descriptors.
         """
         c, d = bridged
         again = c.bridged is not None or d.bridged is not None
-        key = (a.key, b.key, fine, _bits(c), _bits(d))
+        key = (a.key, b.key, fine, seeded, _bits(c), _bits(d))
         with self._lock:
             known = self._pairs.get(key)
         if known is not None and all(
@@ -240,11 +259,43 @@ class FlowCorrespondence:
                 surer(both[0], self._checked(c, (c, d), ab, ba, start_ab), c.bridged, share),
                 surer(both[1], self._checked(d, (d, c), ba, ab, start_ba), d.bridged, share),
             )
+        if seeded:
+            seeds = self._seeds.between(a, b, c.bridged, d.bridged)
+            both = self._seeded(seeds, (c, d), (ab, ba), both, fine)
         with self._lock:
             self._pairs[key] = both
             while len(self._pairs) > _PAIRS:
                 self._pairs.popitem(last=False)
         return replace(both[0]), replace(both[1])
+
+    def _seeded(
+        self,
+        seeds: Seeds,
+        frames: tuple[FlowFrame, FlowFrame],
+        flows: tuple[Array, Array],
+        edges: tuple[Edge, Edge],
+        fine: bool,
+    ) -> tuple[Edge, Edge]:
+        """The edges, with surer matches of a search that sets out from the seeds.
+
+        Args:
+            frames: without what moves. flows: dense flow between them, there and back.
+        """
+        if not len(seeds):
+            return edges
+        a, b = frames
+        (ab, off), (ba, missed) = drawn(flows[0], seeds), drawn(flows[1], seeds.turned())
+        if not (np.maximum(off, missed) > _SEEDED).any():
+            return edges
+        ab, ba = self._search(a, b, ab, fine, near=True), self._search(b, a, ba, fine, near=True)
+        found = (
+            self._checked(a, (a, b), ab, ba, edges[0].started),
+            self._checked(b, (b, a), ba, ab, edges[1].started),
+        )
+        return (
+            surer(edges[0], found[0], a.bridged, clearly=_CLEARLY),
+            surer(edges[1], found[1], b.bridged, clearly=_CLEARLY),
+        )
 
     def _started(self, a: FlowFrame, b: FlowFrame, start: Array | None, fine: bool) -> Array:
         """Dense flow a -> b from these targets; without, as the motion filter searches."""

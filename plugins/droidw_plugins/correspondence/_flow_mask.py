@@ -90,7 +90,11 @@ def bridge(frame: FlowFrame, gate: Array, below: float, reach: int) -> FlowFrame
 
 
 def surer(
-    edge: Edge, other: Edge, bridged: npt.NDArray[np.bool_] | None, share: float = 1.0
+    edge: Edge,
+    other: Edge,
+    bridged: npt.NDArray[np.bool_] | None,
+    share: float = 1.0,
+    clearly: float = 1.0,
 ) -> Edge:
     """The edge, with those matches of another search of it that are surer.
 
@@ -98,8 +102,9 @@ def surer(
         bridged: [h,w] cells of which the other search knows nothing; None: nowhere.
         share: of their confidence that these keep. Gates alone leave what moves too much where
             nine tenths of all confidence lie on it.
+        clearly: how many times as sure a match has to be.
     """
-    better = other.confidence[..., :2].sum(-1) > edge.confidence[..., :2].sum(-1)
+    better = other.confidence[..., :2].sum(-1) > clearly * edge.confidence[..., :2].sum(-1)
     if bridged is not None:
         better &= ~bridged
     target = np.where(better[..., None], other.target, edge.target)

@@ -110,6 +110,8 @@ class FlowSession:
             i, j = request.ii[row], request.jj[row]
             pairs.setdefault((min(i, j), max(i, j)), {})[i < j] = row
 
+        options = self._owner.options
+        seeded = options.seeds > 0 and (request.doubtful or options.seeds_always)
         valid = request.valid.cpu().numpy() if request.informed and wanted else None
 
         def start(row: int | None) -> Array | None:
@@ -121,7 +123,9 @@ class FlowSession:
             a, b = request.payload(key[0]), request.payload(key[1])
             starts = start(rows.get(True)), start(rows.get(False))
             without = bridged.get(key[0], a), bridged.get(key[1], b)
-            return lambda: self._owner.both_ways(a, b, *starts, self._fine, bridged=without)
+            return lambda: self._owner.both_ways(
+                a, b, *starts, self._fine, bridged=without, seeded=seeded
+            )
 
         measured = self._owner.map([job(key, rows) for key, rows in pairs.items()])
         for rows, both in zip(pairs.values(), measured, strict=True):

@@ -130,6 +130,19 @@ class FlowOptions:
             "le": 1.0,
         },
     )
+    seeds: int = field(
+        default=1500,
+        metadata={
+            "help": "points of a keyframe that are matched by their descriptors (SIFT) where the "
+            "path is in doubt; another search sets out from those that are off what was found, "
+            "and its matches count where they are surer (0: none)",
+            "ge": 0,
+        },
+    )
+    seeds_always: bool = field(
+        default=False,
+        metadata={"help": "the same where nothing is in doubt, too, for twice the time"},
+    )
     still: float = field(
         default=0.35, metadata={"help": "flow that counts as no motion, in pixels", "ge": 0.0}
     )

@@ -1,0 +1,166 @@
+"""Points matched by descriptors, and searches that set out from them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from droidw_plugins.correspondence._flow_seeds import (
+    SeedBook,
+    Seeds,
+    coherent,
+    detect,
+    drawn,
+    matched,
+    uncovered,
+)
+from droidw_plugins.correspondence._flow_types import FlowFrame
+
+HEIGHT, WIDTH, STRIDE = 160, 208, 8
+SHIFT = np.array([12, -7])
+
+
+def marks(seed=0, count=60, blank=128.0):
+    """Grey levels [H,W] of a wall with small marks, each unlike the others."""
+    random = np.random.default_rng(seed)
+    grey = np.full((HEIGHT, WIDTH), blank)
+    for y, x in zip(
+        random.integers(8, HEIGHT - 16, count), random.integers(8, WIDTH - 16, count), strict=True
+    ):
+        grey[y : y + 5, x : x + 5] = random.integers(0, 2, (5, 5)) * 120 + 60
+    return grey
+
+
+def moved(grey, shift=SHIFT):
+    return np.roll(grey, shift, axis=(1, 0))
+
+
+def picture(grey):
+    return np.clip(cv2.GaussianBlur(grey, (0, 0), 0.7) + 0.5, 0, 255).astype(np.uint8)
+
+
+def frame_of(index, grey):
+    centres = np.zeros((HEIGHT // STRIDE, WIDTH // STRIDE, 2), np.float32)
+    return FlowFrame(index, picture(grey), centres, centres, centres, centres, STRIDE)
+
+
+def test_points_are_found_where_they_went():
+    seeds = matched(detect(picture(marks()), 500), detect(picture(moved(marks())), 500))
+    off = np.abs(seeds.there - seeds.here - SHIFT).max(axis=1)
+    assert len(seeds) > 60
+    assert (off < 0.3).mean() > 0.9
+    kept = coherent(seeds)
+    assert len(kept) > 0.7 * len(seeds)
+    assert np.abs(kept.there - kept.here - SHIFT).max() < 2.5
+
+
+def test_a_blank_picture_has_no_points_and_matches_nothing():
+    blank, seen = detect(picture(marks(count=0)), 500), detect(picture(marks()), 500)
+    assert len(blank.at) == 0
+    for pair in ((blank, seen), (seen, blank), (blank, blank)):
+        assert len(coherent(matched(*pair))) == 0
+
+
+def test_products_of_descriptors_are_exact():
+    points = detect(picture(marks()), 500)
+    wide = points.descriptor.astype(np.float64)
+    exact = wide @ wide.T
+    narrow = points.descriptor.astype(np.float32)
+    assert exact.max() < 2**24  # whole numbers up to this are exact in float32
+    assert np.array_equal(exact, narrow @ narrow.T)
+    # and all are as long as each other, which `matched` relies on
+    assert np.abs(np.diag(exact) / 255**2 - 1).max() < 0.03
+
+
+def field(count=30):
+    random = np.random.default_rng(1)
+    here = random.uniform(20, 140, (count, 2)).astype(np.float32)
+    return Seeds(here, here + SHIFT.astype(np.float32))
+
+
+def test_what_moves_unlike_all_around_it_is_left_out():
+    seeds = field()
+    there = seeds.there.copy()
+    wrong = np.arange(len(seeds)) % 6 == 0
+    there[wrong] += np.linspace(-90, 90, 2 * wrong.sum()).reshape(-1, 2) + 20
+    kept = coherent(replace(seeds, there=there))
+    assert np.array_equal(kept.here, seeds.here[~wrong])
+    assert len(coherent(seeds.where(np.arange(len(seeds)) < 4))) == 0  # too few to tell
+
+
+def test_one_corner_found_many_times_has_no_vote_for_itself():
+    here = np.full((9, 2), 50, np.float32) + np.linspace(0, 1, 9, dtype=np.float32)[:, None]
+    assert len(coherent(Seeds(here, here + 5))) == 0
+
+
+def test_points_on_closed_cells_and_their_border_are_left_out():
+    closed = np.zeros((20, 26), bool)
+    closed[5, 7] = True  # x from 56 to 63, y from 40 to 47
+    here = np.array([[57, 41], [54, 44], [65, 44], [52, 44], [59, 51]], np.float32)
+    elsewhere = np.full_like(here, 150.0)
+    expected = [[52, 44], [59, 51]]
+    assert uncovered(Seeds(here, elsewhere), closed, None, STRIDE).here.tolist() == expected
+    assert uncovered(Seeds(elsewhere, here), None, closed, STRIDE).there.tolist() == expected
+    assert len(uncovered(Seeds(here, here), None, None, STRIDE)) == len(here)
+
+
+def test_flow_is_drawn_to_seeds_near_it_and_stays_elsewhere():
+    here = np.array([[60, 80], [64, 84]], np.float32)
+    seeds = Seeds(here, here + np.float32([9, 3]))
+    flow = np.full((HEIGHT, WIDTH, 2), (1.0, 0.0), np.float32)
+    pulled, off = drawn(flow, seeds)
+    assert off == pytest.approx([np.hypot(8, 3)] * 2, rel=1e-5)
+    assert np.abs(pulled[82, 62] - (9, 3)).max() < 1.5
+    assert np.array_equal(pulled[20, 180], flow[20, 180])
+    assert np.array_equal(flow[82, 62], (1.0, 0.0))  # not in place
+
+
+def test_what_is_kept_of_a_pair_does_not_depend_on_what_was_closed_first():
+    a, b = frame_of(0, marks()), frame_of(1, moved(marks()))
+    closed = np.zeros((HEIGHT // STRIDE, WIDTH // STRIDE), bool)
+    closed[:, 8:] = True
+    book, other = SeedBook(500), SeedBook(500)
+    some, everything = book.between(a, b, here=closed), book.between(a, b)
+    assert np.array_equal(everything.here, other.between(a, b).here)
+    assert 0 < len(some) < len(everything)
+    assert some.here[:, 0].max() < 64 - 1
+
+
+@pytest.fixture(scope="module")
+def found(operator, frame, question):
+    """Displacement [h,w,2] px and confidence [h,w,3] of a wall that moved by a period of its lines.
+
+    The prediction is that it has not moved, and all its lines agree with that.
+    """
+
+    def call(**options):
+        x = np.mgrid[:HEIGHT, :WIDTH][1]
+        lines = 128 + 50 * np.cos(2 * np.pi * x / 26)
+        mark = marks(count=40) - 128
+        pictures = [picture(lines + np.roll(mark, s, axis=1)) for s in (0, 26)]
+        part = operator(**options)
+        given = [frame(n, grey.astype(np.float64)) for n, grey in enumerate(pictures)]
+        request = replace(question(part, given), informed=True)
+        answer = part.session("window").update(request)
+        return 8 * (answer.target[0] - request.coords[0]), answer.confidence[0]
+
+    return call
+
+
+def test_seeds_lead_out_of_a_wrong_prediction(found):
+    right = []
+    for seeds in (0, 1500):
+        displacement, confidence = found(seeds=seeds, seeds_always=True)
+        weight = confidence[..., :2].sum(-1)
+        near = (displacement - torch.tensor([26.0, 0.0])).norm(dim=-1) < 1
+        right.append(float((weight * near).sum() / weight.sum()))
+    assert right[1] > right[0] + 0.2
+
+
+def test_seeds_of_one_run_are_those_of_the_next(found):
+    one, other = found(seeds_always=True), found(seeds_always=True)
+    assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
