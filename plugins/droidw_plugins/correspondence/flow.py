@@ -167,5 +167,6 @@ COMPONENT: Component[Correspondence] = Component(
     requires=("cv2",),
     capabilities=frozenset({"cpu", "cuda", "host", "threads"}),
     reference="Kroeger et al., Fast Optical Flow using Dense Inverse Search, ECCV 2016; "
-    "OpenCV's implementation (Apache-2.0)",
+    "Lowe, Distinctive Image Features from Scale-Invariant Keypoints, IJCV 2004; "
+    "OpenCV's implementations (Apache-2.0)",
 )
