@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -27,7 +26,7 @@ from droidw_plugins.correspondence._flow_mask import grown, surer, without
 from droidw_plugins.correspondence._flow_polish import polished
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
-from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Track
+from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Kept, Track
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Grid
@@ -68,12 +67,11 @@ class FlowCorrespondence:
         workers = options.workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
         self._local = threading.local()
-        self._lock = threading.Lock()
         self._latest: tuple[_Pair, Array] | None = None
-        self._full: OrderedDict[_Pair, Array] = OrderedDict()
-        self._grid: OrderedDict[_Pair, Array] = OrderedDict()
+        self._full: Kept[_Pair, Array] = Kept(_FULL_FIELDS)
+        self._grid: Kept[_Pair, Array] = Kept(_GRID_FIELDS)
         self._seeds = SeedBook(options.seeds)
-        self._pairs: OrderedDict[tuple[Hashable, ...], tuple[Edge, Edge]] = OrderedDict()
+        self._pairs: Kept[tuple[Hashable, ...], tuple[Edge, Edge]] = Kept(_PAIRS)
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
         """Grey image, less what the user's mask covers, and its structure at the cells."""
@@ -95,10 +93,7 @@ class FlowCorrespondence:
         """Nothing more is needed of a keyframe; the flow that made it one is kept for its edge."""
         if self._latest is not None and self._latest[0][1] == payload.key:
             key, flow = self._latest
-            with self._lock:
-                self._full[key] = flow
-                while len(self._full) > _FULL_FIELDS:
-                    self._full.popitem(last=False)
+            self._full.put(key, flow)
         return payload
 
     def motion(self, reference: FlowFrame, current: FlowFrame) -> Motion:
@@ -169,8 +164,7 @@ class FlowCorrespondence:
 
     def _free(self, a: FlowFrame, b: FlowFrame) -> Array:
         """Flow a -> b without geometry: the motion filter's, where it made b a keyframe."""
-        with self._lock:
-            flow = self._full.get((a.key, b.key))
+        flow = self._full.get((a.key, b.key))
         return self._search(a, b) if flow is None else flow
 
     def _moved(
@@ -178,15 +172,11 @@ class FlowCorrespondence:
     ) -> Array:
         """Displacement [h,w,2] px at the cells."""
         key = (a.key, b.key)
-        with self._lock:
-            known = self._grid.get(key)
+        known = self._grid.get(key)
         if known is not None:
             return known
         moved = sample(search(a, b), a.centres)
-        with self._lock:
-            self._grid[key] = moved
-            while len(self._grid) > _GRID_FIELDS:
-                self._grid.popitem(last=False)
+        self._grid.put(key, moved)
         return moved
 
     def _agreement(self, a: FlowFrame, b: FlowFrame, moved: Array) -> Array:
@@ -240,32 +230,27 @@ class FlowCorrespondence:
         c, d = bridged
         again = c.bridged is not None or d.bridged is not None
         key = (a.key, b.key, fine, seeded, _bits(c), _bits(d))
-        with self._lock:
-            known = self._pairs.get(key)
+        known = self._pairs.get(key)
         if known is not None and all(
             _close(edge.started, start)
             for edge, start in zip(known, (start_ab, start_ba), strict=True)
         ):
             return replace(known[0]), replace(known[1])
         ab, ba = self._started(a, b, start_ab, fine), self._started(b, a, start_ba, fine)
-        both = (
-            self._checked(c, (a, b), ab, ba, start_ab),
-            self._checked(d, (b, a), ba, ab, start_ba),
-        )
+        starts = start_ab, start_ba
+        both = self._checked_both((c, d), (a, b), (ab, ba), starts)
         if again:
             ab, ba = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
             share = self.options.bridged_share
+            there, back = self._checked_both((c, d), (c, d), (ab, ba), starts)
             both = (
-                surer(both[0], self._checked(c, (c, d), ab, ba, start_ab), c.bridged, share),
-                surer(both[1], self._checked(d, (d, c), ba, ab, start_ba), d.bridged, share),
+                surer(both[0], there, c.bridged, share),
+                surer(both[1], back, d.bridged, share),
             )
         if seeded:
             seeds = self._seeds.between(a, b, c.bridged, d.bridged)
             both = self._seeded(seeds, (c, d), (ab, ba), both, fine)
-        with self._lock:
-            self._pairs[key] = both
-            while len(self._pairs) > _PAIRS:
-                self._pairs.popitem(last=False)
+        self._pairs.put(key, both)
         return replace(both[0]), replace(both[1])
 
     def _seeded(
@@ -288,13 +273,11 @@ class FlowCorrespondence:
         if not (np.maximum(off, missed) > _SEEDED).any():
             return edges
         ab, ba = self._search(a, b, ab, fine, near=True), self._search(b, a, ba, fine, near=True)
-        found = (
-            self._checked(a, (a, b), ab, ba, edges[0].started),
-            self._checked(b, (b, a), ba, ab, edges[1].started),
-        )
+        starts = edges[0].started, edges[1].started
+        there, back = self._checked_both(frames, frames, (ab, ba), starts)
         return (
-            surer(edges[0], found[0], a.bridged, clearly=_CLEARLY),
-            surer(edges[1], found[1], b.bridged, clearly=_CLEARLY),
+            surer(edges[0], there, a.bridged, clearly=_CLEARLY),
+            surer(edges[1], back, b.bridged, clearly=_CLEARLY),
         )
 
     def _started(self, a: FlowFrame, b: FlowFrame, start: Array | None, fine: bool) -> Array:
@@ -333,6 +316,20 @@ class FlowCorrespondence:
         if self._raster is None or self._raster.shape[:2] != (height, width):
             self._raster = pixel_grid(height, width).numpy()
         return self._raster
+
+    def _checked_both(
+        self,
+        frames: tuple[FlowFrame, FlowFrame],
+        searched: tuple[FlowFrame, FlowFrame],
+        flows: tuple[Array, Array],
+        starts: tuple[Array | None, Array | None],
+    ) -> tuple[Edge, Edge]:
+        """Both edges between these frames, whose flow there and back was `searched` in pictures."""
+        (a, b), (ab, ba) = frames, flows
+        return (
+            self._checked(a, searched, ab, ba, starts[0]),
+            self._checked(b, searched[::-1], ba, ab, starts[1]),
+        )
 
     def _checked(
         self,

@@ -8,8 +8,6 @@ descriptors wherever they went.
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from droidw_plugins.correspondence._flow_types import Array
+from droidw_plugins.correspondence._flow_types import Array, Kept
 
 if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow_types import FlowFrame
@@ -92,35 +90,26 @@ class SeedBook:
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self._points: OrderedDict[tuple[int, int], Points] = OrderedDict()
-        self._matches: OrderedDict[tuple[tuple[int, int], tuple[int, int]], Seeds] = OrderedDict()
-        self._lock = threading.Lock()
+        self._points: Kept[tuple[int, int], Points] = Kept(_PICTURES)
+        self._matches: Kept[tuple[tuple[int, int], tuple[int, int]], Seeds] = Kept(_PAIRS)
 
     def between(
         self, a: FlowFrame, b: FlowFrame, here: Mask | None = None, there: Mask | None = None
     ) -> Seeds:
         """Seeds from one frame to another, but for cells [h,w] that are taken out of either."""
         key = (a.key, b.key)
-        with self._lock:
-            seeds = self._matches.get(key)
+        seeds = self._matches.get(key)
         if seeds is None:
             seeds = matched(self._points_of(a), self._points_of(b))
-            self._keep(self._matches, key, seeds, _PAIRS)
+            self._matches.put(key, seeds)
         return coherent(uncovered(seeds, here, there, a.stride))
 
     def _points_of(self, frame: FlowFrame) -> Points:
-        with self._lock:
-            points = self._points.get(frame.key)
+        points = self._points.get(frame.key)
         if points is None:
             points = detect(frame.grey, self._most)
-            self._keep(self._points, frame.key, points, _PICTURES)
+            self._points.put(frame.key, points)
         return points
-
-    def _keep(self, book: OrderedDict[Any, Any], key: Any, value: Any, most: int) -> None:
-        with self._lock:
-            book[key] = value
-            while len(book) > most:
-                book.popitem(last=False)
 
 
 def detect(grey: Picture, most: int) -> Points:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import threading
 import zlib
+from collections import OrderedDict
+from collections.abc import Hashable
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Array", "Edge", "FlowFrame", "Track"]
+__all__ = ["Array", "Edge", "FlowFrame", "Kept", "Track"]
 
 Array = npt.NDArray[np.float32]
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
 
 # Frames that may be missing before the motion so far is forgotten.
 _LONGEST_GAP = 3
@@ -105,3 +111,24 @@ class Track:
             going_on += self.flow
             return going_on
         return going_on if reference.index == self.current else None
+
+
+class Kept(Generic[Key, Value]):
+    """The last `most` values that were put, by key; may be asked from any thread."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._values: OrderedDict[Key, Value] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Key) -> Value | None:
+        """What was put under this key, or None."""
+        with self._lock:
+            return self._values.get(key)
+
+    def put(self, key: Key, value: Value) -> None:
+        """Keep a value, and give up the oldest where that is one too many."""
+        with self._lock:
+            self._values[key] = value
+            while len(self._values) > self._most:
+                self._values.popitem(last=False)
