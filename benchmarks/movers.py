@@ -72,17 +72,24 @@ def paste(folder: Path, made: Path, layers: list[Layer]) -> float:
         shutil.copy(folder / name, made / name)
     shares = []
     for k, path in enumerate(list_images(folder / "rgb")):
-        image = read_image(path).astype(np.float32)
-        moving = np.zeros(image.shape[:2], bool)
-        for layer in layers:
-            mover, share = layer[k]
-            image += share[..., None] * (mover - image)
-            moving |= share > 0.5
-        picture = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+        picture, moving = over(read_image(path), layers, k)
         cv2.imwrite(str(made / "rgb" / path.name), picture[..., ::-1])
         cv2.imwrite(str(made / "mask" / path.name), moving.astype(np.uint8) * 255)
         shares.append(moving.mean())
     return float(np.mean(shares))
+
+
+def over(
+    picture: npt.NDArray[np.uint8], layers: list[Layer], k: int
+) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
+    """Picture number k [H,W,3] with the layers over it, and what of it [H,W] is theirs."""
+    image = picture.astype(np.float32)
+    moving = np.zeros(image.shape[:2], bool)
+    for layer in layers:
+        mover, share = layer[k]
+        image += share[..., None] * (mover - image)
+        moving |= share > 0.5
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8), moving
 
 
 def main(argv: Sequence[str] | None = None) -> None:

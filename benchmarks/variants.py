@@ -1,0 +1,155 @@
+"""Clips made of real ones: with other movers pasted over them, in reverse, and mirrored.
+
+Two clips with the same scene and camera tell what is luck in a figure: mirrored, a clip is as hard
+and rounded otherwise. In reverse it is another task, as it begins where the first one ends.
+
+    python benchmarks/variants.py DATA OUT
+    droidw run OUT/NAME --preset cpu threads=1
+
+It writes the clips of CLIPS, 320 pixels wide, each also with `_mirrored`, `_reversed` and
+`_reversed_mirrored` behind its name, and says how much of each moves.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from movers import Layer, middle, over, read_layer
+
+from droidw.eval.mask_files import read_mask
+from droidw.io.images import list_images, read_image
+
+CLIPS = (  # name, what is seen, what is pasted over it
+    ("hospital", "tartanair_hospital", ""),
+    ("hospital_camel", "composite_hospital", ""),
+    ("hospital_goat", "tartanair_hospital", "composite_kitchen"),
+    ("hospital_runner", "tartanair_hospital", "davis_parkour+davis_car-roundabout"),
+    ("kitchen", "redkitchen_300", ""),
+    ("kitchen_goat", "composite_kitchen", ""),
+    ("kitchen_camel", "redkitchen_300", "composite_hospital"),
+    ("kitchen_runner", "redkitchen_300", "davis_parkour+davis_car-roundabout"),
+)
+WIDTH, HEIGHT = 320, 240
+
+
+@dataclass(frozen=True)
+class Clip:
+    """A clip in memory.
+
+    Attributes:
+        pictures: [H,W,3] uint8 each. masks: [H,W] bool each, or none at all.
+        times: seconds. poses: rows of `tx ty tz qx qy qz qw`, camera to world, one a picture.
+        pinhole: fx, fy, cx, cy in pixels.
+    """
+
+    pictures: list[npt.NDArray[np.uint8]]
+    masks: list[npt.NDArray[np.bool_]]
+    times: npt.NDArray[np.float64]
+    poses: npt.NDArray[np.float64]
+    pinhole: tuple[float, float, float, float]
+
+    def mirrored(self) -> Clip:
+        """Left and right changed in all pictures, and so in the world."""
+        fx, fy, cx, cy = self.pinhole
+        return replace(
+            self,
+            pictures=[picture[:, ::-1] for picture in self.pictures],
+            masks=[mask[:, ::-1] for mask in self.masks],
+            poses=self.poses * (-1, 1, 1, 1, -1, -1, 1),
+            pinhole=(fx, fy, WIDTH - 1 - cx, cy),
+        )
+
+    def reversed(self) -> Clip:
+        """From the last picture to the first."""
+        return replace(
+            self,
+            pictures=self.pictures[::-1],
+            masks=self.masks[::-1],
+            times=self.times[-1] + self.times[0] - self.times[::-1],
+            poses=self.poses[::-1],
+        )
+
+    def under(self, layers: list[Layer]) -> Clip:
+        """With what moves elsewhere over it."""
+        pasted = [over(picture, layers, k) for k, picture in enumerate(self.pictures)]
+        return replace(
+            self, pictures=[p for p, _ in pasted], masks=[moving for _, moving in pasted]
+        )
+
+    def write(self, folder: Path) -> None:
+        """As a folder that `droidw run` and `droidw eval` read."""
+        names = [f"{k:06d}.png" for k in range(len(self.pictures))]
+        for part, pictures in (
+            ("rgb", [picture[..., ::-1] for picture in self.pictures]),
+            ("mask", [mask.astype(np.uint8) * 255 for mask in self.masks]),
+        ):
+            if pictures:
+                (folder / part).mkdir(parents=True)
+            for name, picture in zip(names, pictures, strict=bool(pictures)):
+                cv2.imwrite(str(folder / part / name), picture)
+        rows = zip(self.times, names, strict=True)
+        (folder / "rgb.txt").write_text("".join(f"{t:.6f} rgb/{name}\n" for t, name in rows))
+        truth = np.column_stack([self.times, self.poses])
+        np.savetxt(folder / "groundtruth.txt", truth, fmt="%.6f" + 7 * " %.7f")
+        camera = zip(("fx", "fy", "cx", "cy"), self.pinhole, strict=True)
+        lines = [f"width {WIDTH}", f"height {HEIGHT}", *(f"{key} {v:.6f}" for key, v in camera)]
+        (folder / "camera.txt").write_text("\n".join(lines) + "\n")
+
+
+def read_clip(folder: Path) -> Clip:
+    """A clip with true poses, as large as all that is written here."""
+    pictures, masks = (
+        list_images(folder / n) if (folder / n).is_dir() else [] for n in ("rgb", "mask")
+    )
+    truth = {row[0]: row[1:] for row in np.loadtxt(folder / "groundtruth.txt", ndmin=2)}
+    times = np.loadtxt(folder / "rgb.txt", usecols=0, ndmin=1)
+    if not set(times.tolist()) <= set(truth) or len(times) != len(pictures):
+        raise SystemExit(f"{folder}: every picture needs a row of rgb.txt and a true pose")
+    values = dict(line.split()[:2] for line in (folder / "camera.txt").read_text().splitlines())
+    scale = WIDTH / float(values["width"])
+    fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+    return Clip(
+        [_small(read_image(path)) for path in pictures],
+        [_small(read_mask(path).astype(np.uint8) * 255) > 127 for path in masks],
+        times,
+        np.array([truth[time] for time in times]),
+        (fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5),
+    )
+
+
+def _small(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    small = middle(image.astype(np.float32), WIDTH, HEIGHT)
+    return np.clip(np.rint(small), 0, 255).astype(np.uint8)
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Write the clips."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path, help="folder of the clips that these are made of")
+    parser.add_argument("out", type=Path, help="folder to write, not there yet")
+    asked = parser.parse_args(argv)
+    if asked.out.exists():
+        raise SystemExit(f"{asked.out} is there already; name another folder")
+    for name, scene, movers in CLIPS:
+        clip = read_clip(asked.data / scene)
+        if movers:
+            count = len(clip.pictures)
+            folders = [asked.data / mover for mover in movers.split("+")]
+            clip = clip.under([read_layer(f, WIDTH, HEIGHT, count) for f in folders])
+        share = np.mean(clip.masks) if clip.masks else 0.0
+        back = clip.reversed()
+        clip.write(asked.out / name)
+        clip.mirrored().write(asked.out / f"{name}_mirrored")
+        back.write(asked.out / f"{name}_reversed")
+        back.mirrored().write(asked.out / f"{name}_reversed_mirrored")
+        print(f"{name}: {len(clip.pictures)} pictures, {share:.0%} of them moves")
+
+
+if __name__ == "__main__":
+    main()
