@@ -22,7 +22,7 @@ from droidw_plugins.correspondence._flow_information import (
     trust,
     turned,
 )
-from droidw_plugins.correspondence._flow_mask import grown, surer, without
+from droidw_plugins.correspondence._flow_mask import grown, rounded, softened, surer, without
 from droidw_plugins.correspondence._flow_polish import polished
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
@@ -79,15 +79,16 @@ class FlowCorrespondence:
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         centres = grid.centres().numpy().astype(np.float32)
         scaled = grey * np.float32(255.0)
-        grey8 = np.clip(scaled + 0.5, 0, 255).astype(np.uint8)
+        sharp = rounded(scaled)
         covered = flat = None
         if frame.mask is not None:
             covered = frame.mask.cpu().numpy()
-            grey8 = without(grey8, covered)
-            scaled = grey8.astype(np.float32)
+            sharp = without(sharp, covered)
+            scaled = sharp.astype(np.float32)
             flat = grown(covered, self.options.reach) if self.options.reach else None
-        seen = structure(scaled, centres, self.stride, flat)
-        return FlowFrame(frame.index, grey8, *seen, centres, self.stride, covered)
+        soft = rounded(softened(sharp, self.options.blur))
+        seen = structure(softened(scaled, self.options.blur), centres, self.stride, flat)
+        return FlowFrame(frame.index, soft, sharp, *seen, centres, self.stride, covered)
 
     def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:
         """Nothing more is needed of a keyframe; the flow that made it one is kept for its edge."""

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from droidw_plugins.correspondence._flow_information import structure
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
-__all__ = ["bridge", "grown", "surer", "without"]
+__all__ = ["bridge", "grown", "rounded", "softened", "surer", "without"]
 
 Picture = npt.NDArray[np.uint8]
 
@@ -63,12 +63,35 @@ def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
     return np.where(covered, filled, grey)
 
 
-def bridge(frame: FlowFrame, gate: Array, below: float, reach: int) -> FlowFrame:
+def softened(grey: Picture | Array, sigma: float) -> Array:
+    """The picture [H,W] after a Gaussian blur of so many pixels (0: none), grey levels.
+
+    Noise and the blocks of compression stand still while a wall moves, and on a bare wall they are
+    all that a search sees besides lines a pixel wide, which it only finds from within that pixel.
+    """
+    exact = grey.astype(np.float32)
+    if sigma == 0:
+        return exact
+    soft: Any = cv2.GaussianBlur(exact, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    blurred: Array = soft
+    return blurred
+
+
+def rounded(grey: Array) -> Picture:
+    """The picture [H,W] in whole grey levels."""
+    whole: Picture = np.clip(grey + 0.5, 0, 255).astype(np.uint8)
+    return whole
+
+
+def bridge(frame: FlowFrame, gate: Array, below: float, reach: int, blur: float = 0.0) -> FlowFrame:
     """The frame with a bridge over the cells whose gate [h,w] is less than `below`.
 
     It is the frame itself where these are too few to matter. Structure beside these cells is that
     of what lies more than `reach` pixels from them (0: of the picture); in them it stays that of
     the picture, by which they keep some confidence.
+
+    Args:
+        blur: of the picture that is searched, as `softened`.
     """
     closed = gate < below
     if closed.mean() < _FEW:
@@ -76,11 +99,12 @@ def bridge(frame: FlowFrame, gate: Array, below: float, reach: int) -> FlowFrame
     height, width = frame.grey.shape
     mask: Any = cv2.resize(closed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     moving = mask > 0
-    made = replace(frame, grey=without(frame.grey, moving), bridged=closed)
+    sharp = without(frame.sharp, moving)
+    made = replace(frame, grey=rounded(softened(sharp, blur)), sharp=sharp, bridged=closed)
     if reach == 0:
         return made
     covered = moving if frame.covered is None else moving | frame.covered
-    grey = frame.grey.astype(np.float32)
+    grey = softened(frame.sharp, blur)
     left = structure(grey, frame.centres, frame.stride, grown(covered, reach))
     whole = frame.texture, frame.power, frame.normal
     texture, power, normal = (

@@ -107,7 +107,7 @@ class SeedBook:
     def _points_of(self, frame: FlowFrame) -> Points:
         points = self._points.get(frame.key)
         if points is None:
-            points = detect(frame.grey, self._most)
+            points = detect(frame.sharp, self._most)
             self._points.put(frame.key, points)
         return points
 

@@ -145,7 +145,7 @@ class FlowSession:
         gates = request.gates(nodes).cpu().numpy()
         frames = [request.payload(node) for node in nodes]
         jobs: list[Callable[[], Any]] = [
-            partial(bridge, f, g, options.bridge, options.reach)
+            partial(bridge, f, g, options.bridge, options.reach, options.blur)
             for f, g in zip(frames, gates, strict=True)
         ]
         made = zip(nodes, self._owner.map(jobs), strict=True)

@@ -16,6 +16,15 @@ class FlowOptions:
     """Options of correspondence `flow`; lengths in pixels of the working image."""
 
     stride: int = field(default=8, metadata={"help": "grid cell in pixels", "ge": 2, "le": 16})
+    blur: float = field(
+        default=0.7,
+        metadata={
+            "help": "Gaussian blur of the pictures that are searched, in pixels: what is left of "
+            "noise and compression on bare walls (0: none)",
+            "ge": 0.0,
+            "le": 4.0,
+        },
+    )
     finest_scale: int = field(
         default=1,
         metadata={"help": "finest pyramid level of the search (0: full size)", "ge": 0, "le": 3},
