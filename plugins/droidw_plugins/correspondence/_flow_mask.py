@@ -91,7 +91,7 @@ def bridge(frame: FlowFrame, gate: Array, below: float, reach: int, blur: float 
     the picture, by which they keep some confidence.
 
     Args:
-        blur: of the picture that is searched, as `softened`.
+        blur: of pictures that are searched, pixels, as in `softened`.
     """
     closed = gate < below
     if closed.mean() < _FEW:

@@ -17,10 +17,9 @@ class FlowOptions:
 
     stride: int = field(default=8, metadata={"help": "grid cell in pixels", "ge": 2, "le": 16})
     blur: float = field(
-        default=0.7,
+        default=0.0,
         metadata={
-            "help": "Gaussian blur of the pictures that are searched, in pixels: what is left of "
-            "noise and compression on bare walls (0: none)",
+            "help": "Gaussian blur, in pixels, of the pictures that are searched (0: none)",
             "ge": 0.0,
             "le": 4.0,
         },
