@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 Tell = Callable[[int, int], None]
 
 # Global passes for a path of which little has changed since it was adjusted.
-_SPLICE_PASSES = 2
+_FEW_PASSES = 2
 
 
 def doubted(
@@ -46,8 +46,9 @@ def doubted(
 ) -> Diagnosis:
     """Where too little of what a run measured agrees, let it have what the way back finds better.
 
-    All of it if more of what it measures agrees, then pieces of the way that agrees less in which
-    it agrees more; with what is kept uncertainty learns once more. What fails is left out.
+    The way there is adjusted once more first, by the measurements that doubt asks for. The way back
+    is kept if more of what it measures agrees, then pieces of the way that agrees less in which it
+    agrees more; with what is kept uncertainty learns once more. What fails is left out.
 
     Args:
         optimiser: of the run; poses, depths and uncertainty of its store may change.
@@ -106,22 +107,34 @@ class _SecondLook:
         options = config.backend
         self._finishes = options.relearn or options.motion_prior > 0
         steps = (1 + int(self._finishes)) * sum(options.passes)
-        steps += int(options.splice) * sum(options.passes[-_SPLICE_PASSES:])
+        steps += (1 + int(options.splice)) * sum(options.passes[-_FEW_PASSES:])
         self._total = len(optimiser.store) + steps
 
     def run(self) -> None:
         """All of it, with `kept` up to date whenever it is left."""
-        options, there = self.config.backend, self.kept
-        back = track_backwards(self.optimiser, self.config, self._tell, self._stopped)
+        options = self.config.backend
+        # Measured as the way back will be, or neither could be held against the other.
+        there = self._adjusted(self.kept, options.passes[-_FEW_PASSES:], learn=False)
+        before = self._done
+        back = track_backwards(
+            self.optimiser,
+            self.config,
+            lambda done, _: self._tell(before + done, self._total),
+            self._stopped,
+        )
         if back is None:
             return
         better = back.agreement > there.agreement
-        _log.info("%.0f %% agrees backwards%s", 100 * back.agreement, ", kept" if better else "")
-        if better:
-            self.kept, self.share = back, 1.0
+        _log.info(
+            "%.0f %% agrees, measured once more; %.0f %% backwards%s",
+            100 * there.agreement,
+            100 * back.agreement,
+            ", kept" if better else "",
+        )
+        self.kept, self.share = (back, 1.0) if better else (there, 0.0)
         if options.splice:
             self._splice(there if better else back)
-        if self._finishes and self.kept is not there:
+        if self._finishes:
             self._finish()
         self._events.emit(Progress("backwards", self._total, self._total))
 
@@ -135,7 +148,7 @@ class _SecondLook:
             return
         inside = torch.tensor(taken)
         joined = spliced(self.kept, other, taken, optimiser.gates())
-        found = self._adjusted(joined, passes[-_SPLICE_PASSES:], learn=False)
+        found = self._adjusted(joined, passes[-_FEW_PASSES:], learn=False)
         # Global adjustment may have left what was taken for it.
         gained = float(lead(support(optimiser, found), known)[inside].sum())
         holds = gained > 0

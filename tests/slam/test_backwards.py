@@ -140,10 +140,11 @@ class Settled:
     Args:
         found: agreement of the way back; None if it was given up, or what it fails with.
         piece: intervals of the other way that agree more, and whether they hold.
+        again: agreement of the way there, measured once more before both are compared.
         adjusted: agreement after each further global adjustment, or what it fails with.
         stopped: whether the run is to end, once the way back is found.
     Attributes:
-        learned: for each further global adjustment, whether uncertainty was to learn.
+        learned: for each global adjustment after the way back, whether uncertainty was to learn.
         passes: of each of these, all without the wide kernel.
         priors: how much steady motion counted in each of these.
     """
@@ -151,7 +152,7 @@ class Settled:
     def __init__(self, optimiser, config, monkeypatch, found, agreement=0.5, **more):
         self.asked, self.learned, self.passes, self.compared = 0, [], [], 0
         self.priors = []
-        self.more = {"piece": (), "holds": True, "adjusted": 0.7} | more
+        self.more = {"piece": (), "holds": True, "again": agreement, "adjusted": 0.7} | more
         self.found = bent(optimiser.store, found) if isinstance(found, float) else found
         monkeypatch.setattr(module, "track_backwards", self.track)
         monkeypatch.setattr(module, "support", self.support)
@@ -159,7 +160,9 @@ class Settled:
         self.events = Dispatcher()
         diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=agreement)
         stopped = self.more.get("stopped", False)
-        self.kept = doubted(optimiser, config, diagnosis, self.events, lambda: stopped)
+        self.kept = doubted(
+            optimiser, config, diagnosis, self.events, lambda: stopped and self.asked > 0
+        )
 
     def track(self, *arguments):
         self.asked += 1
@@ -178,6 +181,10 @@ class Settled:
 
     def adjust(self, backend, tell):
         assert backend.config.backend.wide_start == 1.0
+        if not self.asked:
+            assert not backend.config.schedule["global"].learn
+            backend.agreement = self.more["again"]
+            return
         self.passes.append(backend.config.backend.passes)
         self.learned.append(backend.config.schedule["global"].learn)
         self.priors.append(backend.motion_prior)
@@ -196,8 +203,20 @@ def test_what_was_found_first_stays_unless_more_agrees(optimiser, config, monkey
     assert (made.kept.agreement, made.kept.backwards) == (0.5, 0.0)
     assert torch.equal(optimiser.store.T_cw, before)
     assert any("no memory" in text for text in made.events.warnings) == isinstance(found, Exception)
-    # Nothing has changed that could be learned from.
-    assert made.learned == []
+    # It has been measured as what is in doubt is, so there is something to learn from.
+    assert made.learned == ([True] if isinstance(found, float) else [])
+
+
+def test_both_ways_are_compared_as_they_agree_when_measured_alike(optimiser, config, monkeypatch):
+    other = bent(optimiser.store, 0.45)
+    made = Settled(optimiser, config, monkeypatch, 0.45, again=0.4)
+    assert (made.kept.agreement, made.kept.backwards) == (0.45, 1.0)
+    assert torch.equal(optimiser.store.T_cw, other.T_cw)
+
+
+def test_nothing_is_kept_of_a_look_that_found_no_way_back(optimiser, config, monkeypatch):
+    made = Settled(optimiser, config, monkeypatch, None, again=0.4)
+    assert (made.kept.agreement, made.kept.backwards) == (0.5, 0.0)
 
 
 def test_the_way_back_is_kept_where_more_agrees_and_learned_from(optimiser, config, monkeypatch):
@@ -224,7 +243,7 @@ def test_pieces_that_global_adjustment_leaves_are_not_kept(optimiser, config, mo
     made = Settled(optimiser, config, monkeypatch, 0.4, piece=range(3, 7), holds=False)
     assert (made.kept.agreement, made.kept.backwards) == (0.5, 0.0)
     assert torch.equal(optimiser.store.T_cw, before)
-    assert made.learned == [False]
+    assert made.learned == [False, True]
 
 
 @pytest.mark.parametrize(("learn", "prior"), [(True, 0.0), (False, 30.0), (True, 30.0)])
@@ -299,7 +318,8 @@ def test_it_is_told_how_far_it_is(optimiser, config, splice):
     diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=0.5)
     doubted(optimiser, config, diagnosis, Dispatcher([("heard", heard)]), lambda: False)
     told = [(event.done, event.total) for event in heard.events]
-    total = COUNT + 2 * (1 + splice)
-    assert told[: COUNT + 2] == [(k, total) for k in [*range(COUNT), COUNT + 1, COUNT + 2]]
+    total = COUNT + 2 * (2 + splice)
+    steps = [1, 2, *range(2, 2 + COUNT), COUNT + 3, COUNT + 4]
+    assert told[: COUNT + 4] == [(k, total) for k in steps]
     assert told[-1] == (total, total)
     assert all(isinstance(event, Progress) for event in heard.events)
