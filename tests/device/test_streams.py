@@ -17,8 +17,9 @@ FLOW = (
     "cpu",
     "features={name: fit3d, options: {precision: float32}}",
     "depth={name: metric3d, options: {variant: vit-small, size: [56, 84], precision: float32}}",
-    # each step lets the rounding of a path without parallax grow
+    # each step lets the rounding of a path without parallax grow, and a second look has many
     "schedule.global.iterations=4",
+    "backend.backwards_below=0",
 )
 DROID = ("--preset", "droid-slam", "correspondence.options={precision: float32, store: float}",
          "uncertainty=affine-softplus", "features=fit3d", "frontend.predict=velocity")  # fmt: skip
@@ -70,6 +71,13 @@ def test_the_stream_is_used_and_in_order(go, ahead_run, name):
     # made-up depth leaves `flow` next to no parallax: rounding of the last place grows to 1 % there
     share = 2e-2 if name == "flow" else 2e-3
     np.testing.assert_allclose(there, cpu, atol=share * np.ptp(cpu, axis=0).max())
+
+
+def test_a_second_look_reads_nothing_too_early(go):
+    with PretendGpu() as gpu:
+        code, wrong, _ = go("cuda", *FLOW, after=(*MOVING, "backend.backwards_below=1"))
+    assert code == 0, wrong
+    assert gpu.streams.faults == []
 
 
 @pytest.mark.parametrize(("broken", "said"), [
