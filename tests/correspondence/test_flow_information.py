@@ -174,8 +174,7 @@ def some_frame(degrees):
 
 def frame_of(grey):
     centres = GRID.centres().numpy().astype(np.float32)
-    levels = grey.astype(np.uint8)
-    return FlowFrame(0, levels, levels, *structure(grey, centres, STRIDE), centres, STRIDE)
+    return FlowFrame(0, grey.astype(np.uint8), *structure(grey, centres, STRIDE), centres, STRIDE)
 
 
 @pytest.mark.parametrize("degrees", ANGLES)
@@ -256,7 +255,7 @@ def test_information_is_the_sum_of_both_directions():
     power = np.sort(g.uniform(0, 40, (*shape, 2)), axis=-1)[..., ::-1].astype(np.float32)
     normal = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
     blank = np.zeros(shape, np.uint8)
-    payload = FlowFrame(0, blank, blank, power, power, normal, power, STRIDE)
+    payload = FlowFrame(0, blank, power, power, normal, power, STRIDE)
     trusted = g.uniform(0, 1, (2, *shape)).astype(np.float32)
     options = flow.COMPONENT.options(texture=2.0, edge_leak=0.5)
     found = information(payload, *trusted, options)

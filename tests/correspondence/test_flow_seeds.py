@@ -45,8 +45,7 @@ def picture(grey):
 
 def frame_of(index, grey):
     centres = np.zeros((HEIGHT // STRIDE, WIDTH // STRIDE, 2), np.float32)
-    seen = picture(grey)
-    return FlowFrame(index, seen, seen, centres, centres, centres, centres, STRIDE)
+    return FlowFrame(index, picture(grey), centres, centres, centres, centres, STRIDE)
 
 
 def test_points_are_found_where_they_went():

@@ -22,7 +22,14 @@ from droidw_plugins.correspondence._flow_information import (
     trust,
     turned,
 )
-from droidw_plugins.correspondence._flow_mask import grown, rounded, softened, surer, without
+from droidw_plugins.correspondence._flow_mask import (
+    grown,
+    rounded,
+    searched,
+    softened,
+    surer,
+    without,
+)
 from droidw_plugins.correspondence._flow_polish import polished
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
@@ -79,16 +86,18 @@ class FlowCorrespondence:
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
         centres = grid.centres().numpy().astype(np.float32)
         scaled = grey * np.float32(255.0)
-        sharp = rounded(scaled)
+        picture = rounded(scaled)
         covered = flat = None
         if frame.mask is not None:
             covered = frame.mask.cpu().numpy()
-            sharp = without(sharp, covered)
-            scaled = sharp.astype(np.float32)
+            picture = without(picture, covered)
+            scaled = picture.astype(np.float32)
             flat = grown(covered, self.options.reach) if self.options.reach else None
-        soft = rounded(softened(sharp, self.options.blur))
+        soft, unsoftened = searched(picture, self.options.blur)
         seen = structure(softened(scaled, self.options.blur), centres, self.stride, flat)
-        return FlowFrame(frame.index, soft, sharp, *seen, centres, self.stride, covered)
+        return FlowFrame(
+            frame.index, soft, *seen, centres, self.stride, covered, unsoftened=unsoftened
+        )
 
     def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:
         """Nothing more is needed of a keyframe; the flow that made it one is kept for its edge."""

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from droidw_plugins.correspondence._flow_information import structure
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
-__all__ = ["bridge", "grown", "rounded", "softened", "surer", "without"]
+__all__ = ["bridge", "grown", "rounded", "searched", "softened", "surer", "without"]
 
 Picture = npt.NDArray[np.uint8]
 
@@ -59,8 +59,7 @@ def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
     for level, share in zip(sums[-2::-1], shares[-2::-1], strict=True):
         above = cv2.pyrUp(bridge, dstsize=(level.shape[1], level.shape[0]))
         bridge = level + above * (1.0 - share)
-    filled = np.clip(bridge + 0.5, 0, 255).astype(np.uint8)
-    return np.where(covered, filled, grey)
+    return np.where(covered, rounded(bridge), grey)
 
 
 def softened(grey: Picture | Array, sigma: float) -> Array:
@@ -69,7 +68,7 @@ def softened(grey: Picture | Array, sigma: float) -> Array:
     Noise and the blocks of compression stand still while a wall moves, and on a bare wall they are
     all that a search sees besides lines a pixel wide, which it only finds from within that pixel.
     """
-    exact = grey.astype(np.float32)
+    exact = grey.astype(np.float32, copy=False)
     if sigma == 0:
         return exact
     soft: Any = cv2.GaussianBlur(exact, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
@@ -81,6 +80,11 @@ def rounded(grey: Array) -> Picture:
     """The picture [H,W] in whole grey levels."""
     whole: Picture = np.clip(grey + 0.5, 0, 255).astype(np.uint8)
     return whole
+
+
+def searched(sharp: Picture, blur: float) -> tuple[Picture, Picture | None]:
+    """`grey` and `unsoftened` of the frame of a picture [H,W]."""
+    return (rounded(softened(sharp, blur)), sharp) if blur > 0 else (sharp, None)
 
 
 def bridge(frame: FlowFrame, gate: Array, below: float, reach: int, blur: float = 0.0) -> FlowFrame:
@@ -99,13 +103,13 @@ def bridge(frame: FlowFrame, gate: Array, below: float, reach: int, blur: float 
     height, width = frame.grey.shape
     mask: Any = cv2.resize(closed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     moving = mask > 0
-    sharp = without(frame.sharp, moving)
-    made = replace(frame, grey=rounded(softened(sharp, blur)), sharp=sharp, bridged=closed)
+    grey, unsoftened = searched(without(frame.sharp, moving), blur)
+    made = replace(frame, grey=grey, unsoftened=unsoftened, bridged=closed)
     if reach == 0:
         return made
     covered = moving if frame.covered is None else moving | frame.covered
-    grey = softened(frame.sharp, blur)
-    left = structure(grey, frame.centres, frame.stride, grown(covered, reach))
+    seen = softened(frame.sharp, blur)
+    left = structure(seen, frame.centres, frame.stride, grown(covered, reach))
     whole = frame.texture, frame.power, frame.normal
     texture, power, normal = (
         np.where(closed[..., None], w, part) for w, part in zip(whole, left, strict=True)

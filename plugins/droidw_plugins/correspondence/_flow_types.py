@@ -28,21 +28,20 @@ class FlowFrame:
 
     Attributes:
         grey: [H,W] uint8, as softened as searches want it.
-        sharp: [H,W] uint8, the same as it came.
         texture: [h,w,2] root mean square image derivative that fixes a match along x and along y,
             each with the other free, grey levels per pixel.
         power: [h,w,2] mean square derivative along `normal` and at right angles to it, the
             eigenvalues of the structure tensor, larger first, (grey levels per pixel)^2.
         normal: [h,w,2] unit vector across the strongest edge, x and y.
         centres: [h,w,2] of the cells, pixels.
-        covered: [H,W] what the frame's mask covers: a smooth bridge in both; None: nothing.
+        covered: [H,W] what the frame's mask covers: `grey` is a smooth bridge there; None: nothing.
         key: tells frames apart, and pictures of one frame with different masks.
-        bridged: [h,w] cells over which both are a smooth bridge, see `_flow_mask`; None: nowhere.
+        bridged: [h,w] cells over which `grey` is a smooth bridge, see `_flow_mask`; None: nowhere.
+        unsoftened: [H,W] uint8, `grey` as it was; None: it has not been softened.
     """
 
     index: int
     grey: npt.NDArray[np.uint8]
-    sharp: npt.NDArray[np.uint8]
     texture: Array
     power: Array
     normal: Array
@@ -50,11 +49,17 @@ class FlowFrame:
     stride: int
     covered: npt.NDArray[np.bool_] | None = None
     bridged: npt.NDArray[np.bool_] | None = None
+    unsoftened: npt.NDArray[np.uint8] | None = None
     key: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
         cover = 0 if self.covered is None else zlib.crc32(np.packbits(self.covered).tobytes())
         object.__setattr__(self, "key", (self.index, cover))
+
+    @property
+    def sharp(self) -> npt.NDArray[np.uint8]:
+        """The picture [H,W] before it was softened."""
+        return self.grey if self.unsoftened is None else self.unsoftened
 
 
 @dataclass
