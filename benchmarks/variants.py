@@ -23,7 +23,10 @@ import numpy.typing as npt
 from movers import Layer, middle, over, read_layer
 
 from droidw.eval.mask_files import read_mask
+from droidw.io.calib import read_calibration
 from droidw.io.images import list_images, read_image
+from droidw.io.tum import read_tum, write_tum
+from droidw.slam.frame import Trajectory
 
 CLIPS = (  # name, what is seen, what is pasted over it
     ("hospital", "tartanair_hospital", ""),
@@ -71,7 +74,7 @@ class Clip:
             self,
             pictures=self.pictures[::-1],
             masks=self.masks[::-1],
-            times=self.times[-1] + self.times[0] - self.times[::-1],
+            times=np.round(self.times[-1] + self.times[0] - self.times[::-1], 6),
             poses=self.poses[::-1],
         )
 
@@ -89,14 +92,14 @@ class Clip:
             ("rgb", [picture[..., ::-1] for picture in self.pictures]),
             ("mask", [mask.astype(np.uint8) * 255 for mask in self.masks]),
         ):
-            if pictures:
-                (folder / part).mkdir(parents=True)
-            for name, picture in zip(names, pictures, strict=bool(pictures)):
+            if not pictures:
+                continue
+            (folder / part).mkdir(parents=True)
+            for name, picture in zip(names, pictures, strict=True):
                 cv2.imwrite(str(folder / part / name), picture)
         rows = zip(self.times, names, strict=True)
         (folder / "rgb.txt").write_text("".join(f"{t:.6f} rgb/{name}\n" for t, name in rows))
-        truth = np.column_stack([self.times, self.poses])
-        np.savetxt(folder / "groundtruth.txt", truth, fmt="%.6f" + 7 * " %.7f")
+        write_tum(folder / "groundtruth.txt", Trajectory(self.times, self.poses))
         camera = zip(("fx", "fy", "cx", "cy"), self.pinhole, strict=True)
         lines = [f"width {WIDTH}", f"height {HEIGHT}", *(f"{key} {v:.6f}" for key, v in camera)]
         (folder / "camera.txt").write_text("\n".join(lines) + "\n")
@@ -107,19 +110,18 @@ def read_clip(folder: Path) -> Clip:
     pictures, masks = (
         list_images(folder / n) if (folder / n).is_dir() else [] for n in ("rgb", "mask")
     )
-    truth = {row[0]: row[1:] for row in np.loadtxt(folder / "groundtruth.txt", ndmin=2)}
+    known = read_tum(folder / "groundtruth.txt")
+    truth = dict(zip(known.times.tolist(), known.T_wc, strict=True))
     times = np.loadtxt(folder / "rgb.txt", usecols=0, ndmin=1)
     if not set(times.tolist()) <= set(truth) or len(times) != len(pictures):
         raise SystemExit(f"{folder}: every picture needs a row of rgb.txt and a true pose")
-    values = dict(line.split()[:2] for line in (folder / "camera.txt").read_text().splitlines())
-    scale = WIDTH / float(values["width"])
-    fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
+    camera, _ = read_calibration(folder / "camera.txt", WIDTH, HEIGHT)
     return Clip(
         [_small(read_image(path)) for path in pictures],
         [_small(read_mask(path).astype(np.uint8) * 255) > 127 for path in masks],
         times,
-        np.array([truth[time] for time in times]),
-        (fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5),
+        np.array([truth[time] for time in times.tolist()]),
+        (camera.fx, camera.fy, camera.cx, camera.cy),
     )
 
 

@@ -6,6 +6,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
+
+from droidw.geometry.se3 import act, inv
 
 
 @pytest.fixture
@@ -31,15 +34,7 @@ def clip(variants):
 
 def seen(pose, pinhole, point):
     """Pixel of a point of the world, by a pose camera to world."""
-    x, y, z, w = pose[3:]
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    at = rotation.T @ (point - pose[:3])
+    at = act(inv(torch.from_numpy(pose)), torch.from_numpy(point)).numpy()
     fx, fy, cx, cy = pinhole
     return np.array([fx * at[0] / at[2] + cx, fy * at[1] / at[2] + cy])
 
