@@ -74,7 +74,8 @@ def structure(
     texture = np.sqrt(np.maximum(np.stack([alone_x, alone_y], -1), 0.0))
     half, mean = (xx - yy) / 2, (xx + yy) / 2
     off = np.hypot(half, xy)
-    power = np.stack([mean + off, np.maximum(mean - off, 0)], -1)
+    # running sums over a flat window may end below 0
+    power = np.maximum(np.stack([mean + off, mean - off], -1), 0.0)
     angle = 0.5 * np.arctan2(xy, half)
     normal = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
     return texture, power, normal
