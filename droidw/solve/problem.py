@@ -139,7 +139,8 @@ class Report:
         cost_before: energy at the start.
         cost_after: energy after the step, NaN unless `guard`.
         step_norm: largest pose update, tangent norm.
-        dropped: measurements left out because target or weight was not finite.
+        dropped: measurements left out because target or weight was not finite, or because a weight
+            below 0 left nothing finite.
         isolated: free poses without any usable measurement; they were held.
     """
 

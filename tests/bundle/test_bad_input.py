@@ -43,6 +43,19 @@ def test_measurements_that_are_not_finite_are_dropped_and_counted(make, field, v
     assert torch.equal(got.disps, expected.disps)
 
 
+@pytest.mark.parametrize("cross", [False, True])
+def test_a_weight_that_rounding_made_negative_costs_its_match_and_no_other(make, cross, step):
+    p, _, _ = make(noise=0.02, huber=0.3, cross=cross)
+    broken, without = p.weight.clone(), p.weight.clone()
+    without[3, 2, 1] = broken[3, 2, 1] = 0.0
+    broken[3, 2, 1, 0] = -1e-19
+    expected, got = step(replace(p, weight=without)), step(replace(p, weight=broken))
+    assert got.report.status == "ok"
+    assert got.report.dropped == 1
+    assert torch.equal(got.T_cw, expected.T_cw)
+    assert torch.equal(got.disps, expected.disps)
+
+
 def test_nothing_but_nan(make, step):
     p, _, _ = make(noise=0.02)
     p = replace(p, target=torch.full_like(p.target, NAN))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -108,6 +109,17 @@ def test_without_texture_the_agreement_alone_counts(measured):
     blank = np.full((HEIGHT, WIDTH), 90.0, dtype=np.float32)
     _, confidence = measured(blank, blank, texture=0.0)
     assert torch.equal(confidence[INNER], torch.tensor([1.0, 1.0, 0.0]).expand(12, 18, 3).double())
+
+
+def test_rounding_beside_texture_leaves_no_negative_power():
+    blocks = np.random.default_rng(2).uniform(0, 255, (24, 32)).round().astype(np.float32)
+    grey = cv2.resize(blocks, (320, 240), interpolation=cv2.INTER_NEAREST)
+    grey = cv2.GaussianBlur(grey, (0, 0), 0.7)
+    covered = np.zeros(grey.shape, dtype=bool)
+    covered[60:200, 80:250] = True
+    centres = Grid.of(240, 320, STRIDE, (STRIDE - 1) / 2).centres().numpy().astype(np.float32)
+    _, power, _ = structure(grey, centres, STRIDE, covered)
+    assert power.min() == 0.0
 
 
 @pytest.mark.parametrize("degrees", ANGLES)

@@ -49,7 +49,7 @@ def gauss_newton_step(problem: BAProblem, work: Workspace, chunk: int, halvings:
     start = _look(problem, layout, sums, work, chunk)
     dropped = 0
     if not start.finite:
-        problem, dropped = _without_nonfinite(problem)
+        problem, dropped = _without_unusable(problem)
         sums = linearise(problem, layout, motions, work, chunk, separate)
         start = _look(problem, layout, sums, work, chunk)
         if not start.finite:
@@ -205,10 +205,14 @@ def _towards_prior(problem: BAProblem, dz: Tensor) -> None:
     torch.where(prior > 0, prior - problem.disps, dz, out=dz)
 
 
-def _without_nonfinite(problem: BAProblem) -> tuple[BAProblem, int]:
-    """The problem with weight 0 on cells whose target or weight is not finite, and their number."""
+def _without_unusable(problem: BAProblem) -> tuple[BAProblem, int]:
+    """The problem with weight 0 on cells that cannot be used, and their number.
+
+    Those whose target or weight is not finite, or whose information is below 0.
+    """
     target, weight = problem.target, problem.weight
-    usable = torch.isfinite(weight[..., :2] * target.square()).all(-1, keepdim=True)
+    diagonal = weight[..., :2]
+    usable = (torch.isfinite(diagonal * target.square()) & (diagonal >= 0)).all(-1, keepdim=True)
     if problem.channels == 3:
         usable &= torch.isfinite(weight[..., 2:] * target.prod(-1, keepdim=True))
     zero = target.new_zeros(())

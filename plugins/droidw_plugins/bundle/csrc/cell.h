@@ -99,13 +99,15 @@ DW_HD Measured<R> measure(
     return m;
 }
 
-// A measurement that is not finite gets the weight and target 0; returns 1 where it was dropped.
+// A measurement that is not finite, or whose information is below 0, gets the weight and target 0;
+// returns 1 where it was dropped.
 template <bool CROSS, class R>
-DW_HD R drop_nonfinite(Match<R>& t) {
+DW_HD R drop_unusable(Match<R>& t) {
     using S = element<R>;
     const R zero = fill<R>(S(0)), one = fill<R>(S(1));
     auto usable = both(
         finite_number(t.wu * (t.tu * t.tu)), finite_number(t.wv * (t.tv * t.tv)));
+    usable = both(usable, both(t.wu >= zero, t.wv >= zero));
     if constexpr (CROSS) {
         usable = both(usable, finite_number(t.cross * (t.tu * t.tv)));
         t.cross = select(usable, t.cross, zero);

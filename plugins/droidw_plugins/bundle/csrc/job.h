@@ -85,7 +85,7 @@ struct Cell {
         const S* const target = static_cast<const S*>(job.target) + 2 * at;
         const S* const weight = static_cast<const S*>(job.weight) + (CROSS ? 3 : 2) * at;
         match = {target[0], target[1], weight[0], weight[1], CROSS ? weight[2] : S(0)};
-        dropped = job.check ? drop_nonfinite<CROSS>(match) : S(0);
+        dropped = job.check ? drop_unusable<CROSS>(match) : S(0);
     }
 };
 

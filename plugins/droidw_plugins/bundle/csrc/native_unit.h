@@ -85,7 +85,7 @@ void edge_block(const View<S, CROSS>& view, int64_t e, const Motion<S> G, const 
     R energies(S(0));
     for (int64_t at = 0; at < n; at += R::lanes) {
         Match<R> t = view.match(target, weight, at, n - at);
-        if (check) dropped += drop_nonfinite<CROSS>(t);
+        if (check) dropped += drop_unusable<CROSS>(t);
         const R here = R::load(d + at);
         const Seen<R> p = project(G, R::load(ray_x + at), R::load(ray_y + at), here);
         const Measured<R> m = measure<CROSS>(K, p, p.ok, t, huber);
@@ -259,7 +259,7 @@ void substitute_unit(const View<S, CROSS>& view, const Unit& unit, const double*
             const S* const weight = view.weight(e) + view.CHANNELS * first;
             for (int64_t at = 0; at < n; at += R::lanes) {
                 Match<R> t = view.match(target, weight, at, n - at);
-                if (view.check) drop_nonfinite<CROSS>(t);
+                if (view.check) drop_unusable<CROSS>(t);
                 const R here = R::load(d + at);
                 const Seen<R> p = project(
                     G, R::load(work.ray_x.data() + first + at),
@@ -290,7 +290,7 @@ double energy_unit(const View<S, CROSS>& start, const View<S, CROSS>& now,
         for (int64_t at = unit.begin; at < unit.end; at += R::lanes) {
             const int64_t left = unit.end - at;
             Match<R> t = start.match(target, weight, at, left);
-            if (start.check) drop_nonfinite<CROSS>(t);
+            if (start.check) drop_unusable<CROSS>(t);
             const R x = R::load(work.ray_x.data() + at), y = R::load(work.ray_y.data() + at);
             const R before = depth_ratio(G0, x, y, Reader<S>::one(start.disps + frame + at, left));
             const R ok = select(before >= R(S(NEAR_DEPTH)), R(S(1)), R(S(0)));
