@@ -164,7 +164,7 @@ class FrontendConfig:
         "middle: the last but two, if its neighbours are nearer than twice the threshold",
     )
     again_below: float = opt(
-        0.65,
+        0.63,
         "agreement of all matches with poses and depths in the end below which the footage is "
         "tracked once more, without what the first time was found to move, if that is 2 % of the "
         "pictures or more (0: never, 1: however much agrees)",
@@ -197,7 +197,7 @@ class BackendConfig:
     )
     factors_per_keyframe: int = opt(10, "directed edges per keyframe at most", ge=2)
     backwards_below: float = opt(
-        0.72,
+        0.7,
         "agreement of all matches with poses and depths below which keyframes are tracked once "
         "more, from the last to the first, and that is kept if more agrees (0: never, 1: however "
         "much agrees)",
@@ -209,6 +209,12 @@ class BackendConfig:
         "of the way that agrees less there and back, take the pieces in which more agrees",
     )
     relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
+    turns: int = opt(
+        2,
+        "times that the passes are made with `relearn` and `motion_prior` for what was kept of "
+        "the way back",
+        ge=1,
+    )
     motion_prior: float = opt(
         100.0,
         "how much steady motion counts for what was kept of the way back: in a first pass, a "

@@ -106,7 +106,7 @@ class _SecondLook:
         self._done = 0
         options = config.backend
         self._finishes = options.relearn or options.motion_prior > 0
-        steps = (1 + int(self._finishes)) * sum(options.passes)
+        steps = (1 + options.turns * int(self._finishes)) * sum(options.passes)
         steps += (1 + int(options.splice)) * sum(options.passes[-_FEW_PASSES:])
         self._total = len(optimiser.store) + steps
 
@@ -172,10 +172,11 @@ class _SecondLook:
         options = self.config.backend
         # What agrees with new weights is nothing to compare with what agreed before.
         agreement = self.kept.agreement
-        found = self._adjusted(
-            self.kept, options.passes, learn=options.relearn, motion_prior=options.motion_prior
-        )
-        self.kept = replace(found, agreement=agreement)
+        for _ in range(options.turns):
+            found = self._adjusted(
+                self.kept, options.passes, learn=options.relearn, motion_prior=options.motion_prior
+            )
+            self.kept = replace(found, agreement=agreement)
 
     def _adjusted(
         self, path: Path, passes: list[int], learn: bool, motion_prior: float = 0.0

@@ -204,7 +204,7 @@ def test_what_was_found_first_stays_unless_more_agrees(optimiser, config, monkey
     assert torch.equal(optimiser.store.T_cw, before)
     assert any("no memory" in text for text in made.events.warnings) == isinstance(found, Exception)
     # It has been measured as what is in doubt is, so there is something to learn from.
-    assert made.learned == ([True] if isinstance(found, float) else [])
+    assert made.learned == ([True, True] if isinstance(found, float) else [])
 
 
 def test_both_ways_are_compared_as_they_agree_when_measured_alike(optimiser, config, monkeypatch):
@@ -224,7 +224,7 @@ def test_the_way_back_is_kept_where_more_agrees_and_learned_from(optimiser, conf
     made = Settled(optimiser, config, monkeypatch, 0.6)
     assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
     assert torch.equal(optimiser.store.T_cw, other.T_cw)
-    assert made.learned == [True]
+    assert made.learned == [True, True]
 
 
 @pytest.mark.parametrize(("found", "share"), [(0.6, 1 - 4 / 13), (0.4, 4 / 13)])
@@ -232,10 +232,10 @@ def test_pieces_of_the_way_that_agrees_less_are_taken(optimiser, config, monkeyp
     config.backend.passes = [1, 2, 3]
     made = Settled(optimiser, config, monkeypatch, found, piece=range(3, 7))
     assert (made.kept.agreement, made.kept.backwards) == (0.7, pytest.approx(share))
-    assert made.learned == [False, True]
-    assert made.passes == [[2, 3], [1, 2, 3]]
+    assert made.learned == [False, True, True]
+    assert made.passes == [[2, 3], [1, 2, 3], [1, 2, 3]]
     # what was taken for its matches is not to be drawn to a steady path before it is weighed
-    assert made.priors == [0.0, config.backend.motion_prior]
+    assert made.priors == [0.0, config.backend.motion_prior, config.backend.motion_prior]
 
 
 def test_pieces_that_global_adjustment_leaves_are_not_kept(optimiser, config, monkeypatch):
@@ -243,17 +243,19 @@ def test_pieces_that_global_adjustment_leaves_are_not_kept(optimiser, config, mo
     made = Settled(optimiser, config, monkeypatch, 0.4, piece=range(3, 7), holds=False)
     assert (made.kept.agreement, made.kept.backwards) == (0.5, 0.0)
     assert torch.equal(optimiser.store.T_cw, before)
-    assert made.learned == [False, True]
+    assert made.learned == [False, True, True]
 
 
+@pytest.mark.parametrize("turns", [1, 3])
 @pytest.mark.parametrize(("learn", "prior"), [(True, 0.0), (False, 30.0), (True, 30.0)])
-def test_learning_and_steady_motion_share_one_adjustment(
-    optimiser, config, monkeypatch, learn, prior
+def test_learning_and_steady_motion_share_adjustments(
+    optimiser, config, monkeypatch, learn, prior, turns
 ):
+    config.backend.turns = turns
     config.backend.relearn, config.backend.motion_prior = learn, prior
     made = Settled(optimiser, config, monkeypatch, 0.6)
     assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
-    assert (made.learned, made.priors) == ([learn], [prior])
+    assert (made.learned, made.priors) == (turns * [learn], turns * [prior])
 
 
 def test_nothing_is_done_that_is_not_asked_for(optimiser, config, monkeypatch):

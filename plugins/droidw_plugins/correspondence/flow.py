@@ -17,7 +17,7 @@ class FlowOptions:
 
     stride: int = field(default=8, metadata={"help": "grid cell in pixels", "ge": 2, "le": 16})
     blur: float = field(
-        default=0.0,
+        default=0.7,
         metadata={
             "help": "Gaussian blur, in pixels, of the pictures that are searched (0: none)",
             "ge": 0.0,
