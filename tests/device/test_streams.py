@@ -20,6 +20,8 @@ FLOW = (
     # each step lets the rounding of a path without parallax grow, and a second look has many
     "schedule.global.iterations=4",
     "backend.backwards_below=0",
+    # softened, its pictures hold a path even less
+    "correspondence.options.blur=0",
 )
 DROID = ("--preset", "droid-slam", "correspondence.options={precision: float32, store: float}",
          "uncertainty=affine-softplus", "features=fit3d", "frontend.predict=velocity")  # fmt: skip
