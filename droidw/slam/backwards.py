@@ -48,7 +48,7 @@ def doubted(
 
     The way there is adjusted once more first, by the measurements that doubt asks for. The way back
     is kept if more of what it measures agrees, then pieces of the way that agrees less in which it
-    agrees more; with what is kept uncertainty learns once more. What fails is left out.
+    agrees more; with what is kept uncertainty goes on learning. What fails is left out.
 
     Args:
         optimiser: of the run; poses, depths and uncertainty of its store may change.
