@@ -251,6 +251,13 @@ class WeightingConfig:
     slope: float = opt(45.0, "slope of the rational gate", gt=0)
     shift: float = opt(35.0, "shift of the rational gate", ge=0)
     floor: float = opt(0.1, "smallest denominator of the rational gate", gt=0)
+    open_share: float = opt(
+        0.5,
+        "share of each picture, of what is least uncertain, that keeps its whole weight: most of "
+        "what is seen stands still (0: no such share)",
+        ge=0,
+        le=1,
+    )
     bidirectional: bool = opt(False, "also weigh by the gate sampled in the target frame")
     confidence_scale: float = opt(1.0, "factor on the confidence of correspondence", gt=0)
     damping_scale: float = opt(0.2, "factor on the learned depth damping", ge=0)

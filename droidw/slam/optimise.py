@@ -17,7 +17,7 @@ from droidw.interfaces.uncertainty import Indices, UncertaintyView
 from droidw.solve.kernel import redescended, usual_square
 from droidw.solve.motion import steady_motion
 from droidw.solve.problem import BAProblem, Report
-from droidw.solve.weights import gate, residual_weights
+from droidw.solve.weights import gate, opened, residual_weights
 
 if TYPE_CHECKING:
     from droidw.config.schema import PhaseConfig, SolverConfig, WeightingConfig
@@ -288,6 +288,7 @@ class Optimiser:
 
     def _gate(self, u: Tensor) -> Tensor:
         w = self.weighting
+        u = opened(u, w.open_share, kind=w.gate, slope=w.slope, shift=w.shift)
         return gate(u, kind=w.gate, slope=w.slope, shift=w.shift, floor=w.floor)
 
     def view(

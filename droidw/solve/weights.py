@@ -8,6 +8,7 @@ a match is far from what the poses predict.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -23,6 +24,7 @@ __all__ = [
     "agreeing_share",
     "agreeing_weight",
     "gate",
+    "opened",
     "residual_weights",
     "unmasked",
 ]
@@ -64,6 +66,31 @@ def gate(
     else:
         raise ValueError(f"no gate is called {kind!r}; valid: rational, inverse, none")
     return torch.where(torch.isfinite(u), weight, torch.zeros_like(weight))
+
+
+def opened(
+    u: Tensor, share: float, kind: GateKind = "rational", slope: float = 45.0, shift: float = 35.0
+) -> Tensor:
+    """Uncertainties such that `gate` leaves at least `share` of each map its whole weight.
+
+    What looks like that which moves is closed with it, and where that is most of a picture, poses
+    follow the corner that is left. Most of what is seen stands still: where too little of a map is
+    small enough, all of it is divided by what makes it so.
+
+    Args:
+        u: [n,h,w] >= 0.
+        share: in [0,1]; 0 leaves `u` as it is.
+        kind, slope, shift: of the gate.
+    Returns:
+        [n,h,w]; a fresh tensor unless nothing is to be done.
+    """
+    if share == 0 or kind == "none" or not u.numel():
+        return u
+    whole = (1.0 + shift) / slope if kind == "rational" else 1.0
+    maps = u.flatten(1)
+    most = maps.kthvalue(max(1, math.ceil(share * maps.shape[1])), dim=1).values
+    factor = torch.where(torch.isfinite(most), whole / most, 1.0).clamp_max(1.0)
+    return u * factor[:, None, None]
 
 
 def unmasked(covered: Tensor) -> Tensor:

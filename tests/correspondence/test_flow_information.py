@@ -137,6 +137,15 @@ def test_the_normal_is_the_direction_of_the_gradient(degrees):
     assert texture.dtype == power.dtype == normal.dtype == np.float32
 
 
+@pytest.mark.parametrize("degrees", ANGLES)
+def test_a_line_has_no_bend_where_it_leaves_the_picture(degrees):
+    centres = GRID.centres().numpy().astype(np.float32)
+    grey = cv2.GaussianBlur(stripes(degrees), (0, 0), 0.7, borderType=cv2.BORDER_REPLICATE)
+    _, power, _ = structure(grey, centres, STRIDE)
+    assert (power[..., 1] < 0.01 * power[..., 0]).all()
+    assert power[..., 0].min() > 0.1 * power[INNER][..., 0].min()
+
+
 def test_a_match_may_slip_along_an_edge_but_not_off_it():
     options = flow.COMPONENT.options()
     normal = np.array([0.6, 0.8], dtype=np.float32)

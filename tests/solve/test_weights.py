@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from droidw.solve.weights import gate, residual_weights, unmasked
+from droidw.solve.weights import gate, opened, residual_weights, unmasked
 
 
 def test_rational_gate_matches_the_published_table() -> None:
@@ -37,6 +37,31 @@ def test_gate_of_nonsense_is_zero_and_bad_arguments_are_refused() -> None:
         gate(nan, "linear")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="positive"):
         gate(nan, floor=0.0)
+
+
+@pytest.mark.parametrize("kind", ["rational", "inverse"])
+def test_a_share_of_each_picture_keeps_its_whole_weight(kind) -> None:
+    generator = torch.Generator().manual_seed(1)
+    closed = 2.0 + torch.rand(6, 10, generator=generator)
+    half = torch.where(torch.arange(10) < 6, 0.3, 1.5).expand(6, 10)
+    left = opened(torch.stack([closed, half]), 0.5, kind)
+    # the least uncertain half, and no more of it than the rest is worth
+    weights = gate(left[0], kind)
+    assert int((weights > 0.999).sum()) == 30
+    assert bool((weights[closed > closed.median()] < 0.999).all())
+    assert torch.equal(left[0].flatten().argsort(), closed.flatten().argsort())
+    assert torch.equal(left[1], half)
+
+
+def test_no_share_or_no_number_opens_nothing() -> None:
+    u = torch.full((1, 2, 3), 5.0)
+    assert torch.equal(opened(u, 0.0), u)
+    assert torch.equal(opened(u, 0.5, "none"), u)
+    assert opened(u[:0], 0.5).shape == (0, 2, 3)
+    mixed = torch.tensor([[[float("nan"), float("inf"), 2.0], [4.0, float("nan"), 8.0]]])
+    assert torch.equal(gate(opened(mixed, 0.5)) > 0.999, mixed <= 8.0)
+    none = torch.full((1, 2, 3), float("nan"))
+    assert gate(opened(none, 0.5)).eq(0).all()
 
 
 def _edges() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:

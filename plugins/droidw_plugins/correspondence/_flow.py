@@ -30,6 +30,7 @@ from droidw_plugins.correspondence._flow_mask import (
     surer,
     without,
 )
+from droidw_plugins.correspondence._flow_motion import picture_motion
 from droidw_plugins.correspondence._flow_polish import polished
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
@@ -119,7 +120,8 @@ class FlowCorrespondence:
         flow = self._search(reference, current, start)
         self._latest = (reference.key, current.key), flow
         moved = self._moved(reference, current, lambda a, b: flow)
-        motion = self._motion(moved, self._agreement(reference, current, moved), reference)
+        agrees = self._agreement(reference, current, moved)
+        motion = picture_motion(moved, agrees, reference, self.options)
         known = motion.matched > _TRACKED
         self._track = Track.after(self._track, reference, current, flow) if known else None
         return motion
@@ -129,17 +131,6 @@ class FlowCorrespondence:
         return FlowSession(self, one_way=purpose == "fill", fine=purpose == "global")
 
     # -- measuring -------------------------------------------------------------------------
-
-    def _motion(self, moved: Array, agrees: Array, reference: FlowFrame) -> Motion:
-        textured = reference.texture.max(axis=-1) > 0.5 * self.options.texture
-        usable = textured & (agrees > 0.3)
-        matched = float(usable.mean())
-        if not usable.any():
-            return Motion(0.0, 0.0)
-        length = np.hypot(moved[..., 0], moved[..., 1])[usable]
-        if (length < self.options.still).mean() > self.options.still_share:
-            return Motion(float(np.median(length)) / self.stride, matched)
-        return Motion(float(length.mean()) / self.stride, matched)
 
     def _search(
         self,

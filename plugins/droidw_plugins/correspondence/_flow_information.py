@@ -18,6 +18,9 @@ __all__ = ["information", "likeness", "sample", "structure", "trust", "turned"]
 
 # Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
 _FLAT = 0.1
+# Pixels at the border of a picture whose derivatives are not its own: of what lies beyond, Scharr
+# and the blur before it know nothing.
+_BORDER = 3
 # Keeps the power of a flat window from being divided by itself.
 _NOTHING = np.float32(1e-12)
 # Mean square difference of a match without any error, grey levels^2: noise and rounding.
@@ -49,6 +52,9 @@ def structure(
 ) -> tuple[Array, Array, Array]:
     """The structure tensor (Foerstner and Guelch 1987) of the neighbourhood of each cell.
 
+    What lies beyond the picture is flat. Were its outermost row repeated there, a line that leaves
+    the picture would have a bend at the border, and a match that slips along it would be held.
+
     Args:
         grey: [H,W] in grey levels. centres: [h,w,2] pixels. stride: of the grid; a window has
             twice its width.
@@ -64,7 +70,7 @@ def structure(
         dx[covered] = 0.0
         dy[covered] = 0.0
     xx, yy, xy = (
-        sample(cv2.blur(p, window, borderType=cv2.BORDER_REPLICATE), centres)
+        sample(cv2.blur(_framed(p), window, borderType=cv2.BORDER_CONSTANT), centres)
         for p in (dx * dx, dy * dy, dx * dy)
     )
     # What the window says of x once y is free, and the other way round: an oblique edge,
@@ -79,6 +85,13 @@ def structure(
     angle = 0.5 * np.arctan2(xy, half)
     normal = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
     return texture, power, normal
+
+
+def _framed(values: Array) -> Array:
+    """The same array [H,W], with 0 at the border of the picture."""
+    values[:_BORDER] = values[-_BORDER:] = 0.0
+    values[:, :_BORDER] = values[:, -_BORDER:] = 0.0
+    return values
 
 
 def trust(apart: Array, normal: Array, options: FlowOptions) -> tuple[Array, Array]:

@@ -158,6 +158,16 @@ class FlowOptions:
         default=0.55,
         metadata={"help": "share of unmoved cells that means a camera at rest", "gt": 0, "le": 1},
     )
+    motion_tiles: int = field(
+        default=6,
+        metadata={
+            "help": "rows and columns of tiles whose middle motions are averaged to tell how much "
+            "the picture moved (0: all cells alike; what moves with the camera and has most of the "
+            "structure then keeps keyframes away)",
+            "ge": 0,
+            "le": 32,
+        },
+    )
     workers: int = field(default=0, metadata={"help": "threads (0: one per core)", "ge": 0})
 
 
