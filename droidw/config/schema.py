@@ -210,7 +210,7 @@ class BackendConfig:
     )
     relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
     turns: int = opt(
-        2,
+        5,
         "times that the passes are made with `relearn` and `motion_prior` for what was kept of "
         "the way back",
         ge=1,
