@@ -65,7 +65,7 @@ def config():
     """Of a run that doubts all; uncertainty does not learn here, as there is none."""
     made = DroidwConfig(camera=CameraConfig(refine_focal=False))
     made.frontend = replace(made.frontend, warmup=WARM)
-    made.backend = BackendConfig(passes=[1, 1], backwards_below=1.0)
+    made.backend = BackendConfig(passes=[1, 1], backwards_below=1.0, turns=2)
     return made
 
 

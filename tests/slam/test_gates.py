@@ -35,7 +35,7 @@ def two_keyframes():
     graph = FactorGraph(6, 8)
     graph.add([(0, 1), (1, 0)])
     parts = Parts(None, None, None, None, None)
-    optimiser = Optimiser(store, parts, WeightingConfig(), Stopwatch())
+    optimiser = Optimiser(store, parts, WeightingConfig(open_share=0.0), Stopwatch())
     return optimiser, graph
 
 
@@ -74,7 +74,7 @@ def test_what_can_move_is_known_before_the_first_search():
     optimiser.parts = Parts(Moving(), None, Moving(), None, None)
     optimiser.begin()
     assert not optimiser.begun  # asked of the parts that it was built with
-    both = Optimiser(optimiser.store, optimiser.parts, WeightingConfig(), Stopwatch())
+    both = Optimiser(optimiser.store, optimiser.parts, WeightingConfig(open_share=0.0), Stopwatch())
     both.store["movable"][1] = 1.0
     both.begin()
     assert both.begun
