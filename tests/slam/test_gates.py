@@ -56,6 +56,20 @@ def test_gates_are_given_where_geometry_and_uncertainty_count(informed, learned)
     assert gates[1].unique().tolist() == [1.0]
 
 
+def test_half_of_a_picture_keeps_its_whole_weight_wherever_gates_are_asked():
+    optimiser, graph = two_keyframes()
+    optimiser.weighting = WeightingConfig()
+    u = torch.linspace(1.5, 3.0, 48).reshape(6, 8)
+    optimiser.store["uncertainty"][1] = u
+    session = Asked()
+    optimiser.measure(graph, session, graph.select(), informed=True, learned=True)
+    asked = session.request.gates([1])[0], optimiser.gates()[1], optimiser.view().gate(u[None])[0]
+    for gate in asked:
+        assert int((gate > 0.999).sum()) == 24
+        assert float(gate[-1, -1]) < 0.1
+    assert int((optimiser.gates(learned=False)[1] == 1.0).sum()) == 48
+
+
 class Moving:
     """Features that say what can move, and a model that begins with it."""
 

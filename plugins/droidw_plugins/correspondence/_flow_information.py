@@ -66,11 +66,13 @@ def structure(
     window = (2 * stride - 1, 2 * stride - 1)
     dx = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32)
     dy = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32)
-    if covered is not None:
-        dx[covered] = 0.0
-        dy[covered] = 0.0
+    for slope in (dx, dy):
+        slope[:_BORDER] = slope[-_BORDER:] = 0.0
+        slope[:, :_BORDER] = slope[:, -_BORDER:] = 0.0
+        if covered is not None:
+            slope[covered] = 0.0
     xx, yy, xy = (
-        sample(cv2.blur(_framed(p), window, borderType=cv2.BORDER_CONSTANT), centres)
+        sample(cv2.blur(p, window, borderType=cv2.BORDER_CONSTANT), centres)
         for p in (dx * dx, dy * dy, dx * dy)
     )
     # What the window says of x once y is free, and the other way round: an oblique edge,
@@ -85,13 +87,6 @@ def structure(
     angle = 0.5 * np.arctan2(xy, half)
     normal = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
     return texture, power, normal
-
-
-def _framed(values: Array) -> Array:
-    """The same array [H,W], with 0 at the border of the picture."""
-    values[:_BORDER] = values[-_BORDER:] = 0.0
-    values[:, :_BORDER] = values[:, -_BORDER:] = 0.0
-    return values
 
 
 def trust(apart: Array, normal: Array, options: FlowOptions) -> tuple[Array, Array]:
