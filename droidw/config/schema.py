@@ -171,6 +171,12 @@ class FrontendConfig:
         ge=0,
         le=1,
     )
+    again_motion: float = opt(
+        0.8,
+        "`motion_filter.threshold` of the second time, where it is less: what little is left to "
+        "see is seen in more keyframes (0: as the first time)",
+        ge=0,
+    )
 
 
 @dataclass
@@ -210,10 +216,17 @@ class BackendConfig:
     )
     relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
     turns: int = opt(
-        5,
+        3,
         "times that the passes are made with `relearn` and `motion_prior` for what was kept of "
         "the way back",
         ge=1,
+    )
+    beyond: float = opt(
+        2.0,
+        "how far past two of these turns the next one sets out, in lengths of the last of them: "
+        "turns lead the same way, each less far than the one before (0: where the last one ended)",
+        ge=0,
+        le=4,
     )
     motion_prior: float = opt(
         100.0,

@@ -8,6 +8,7 @@ was found to move.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,10 +20,11 @@ from droidw.slam.doubt import doubtful
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from droidw.config.schema import DroidwConfig
     from droidw.slam.records import Outcome
     from droidw.slam.system import SlamSystem
 
-__all__ = ["Hidden", "rejection", "to_hide"]
+__all__ = ["Hidden", "denser", "rejection", "to_hide"]
 
 _Mask = npt.NDArray[np.bool_]
 
@@ -82,6 +84,14 @@ def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden | None
         [closed(gate, grid.stride, grid.offset, size, _CLOSED) for gate in gates],
     )
     return hidden if hidden.share >= _FEW else None
+
+
+def denser(config: DroidwConfig) -> DroidwConfig:
+    """The configuration of the second time, in which less motion makes a keyframe."""
+    wanted, threshold = config.frontend.again_motion, config.motion_filter.threshold
+    if not 0 < wanted < threshold:
+        return config
+    return replace(config, motion_filter=replace(config.motion_filter, threshold=wanted))
 
 
 def rejection(first: Outcome, second: Outcome) -> str:

@@ -167,16 +167,23 @@ class _SecondLook:
         """Adjust the path that is kept while uncertainty learns from it and steady motion counts.
 
         Where little of what stands still is seen, matches agree with whatever path they were
-        searched around, and that a camera moves steadily is all that is known.
+        searched around, and that a camera moves steadily is all that is known. So turns lead the
+        same way for long, each less far than the one before: after two of them the next sets out
+        from beyond what they found.
         """
         options = self.config.backend
         # What agrees with new weights is nothing to compare with what agreed before.
         agreement = self.kept.agreement
+        steps = [self.kept]
         for _ in range(options.turns):
+            start = self.kept
+            if len(steps) == 3 and options.beyond > 0:
+                start, steps = self.kept.beyond(steps[1], options.beyond), []
             found = self._adjusted(
-                self.kept, options.passes, learn=options.relearn, motion_prior=options.motion_prior
+                start, options.passes, learn=options.relearn, motion_prior=options.motion_prior
             )
             self.kept = replace(found, agreement=agreement)
+            steps.append(self.kept)
 
     def _adjusted(
         self, path: Path, passes: list[int], learn: bool, motion_prior: float = 0.0

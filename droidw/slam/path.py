@@ -5,14 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import torch
 from torch import Tensor
 
-from droidw.geometry.se3 import inv, mul
+from droidw.geometry.se3 import exp, inv, log, mul
 
 if TYPE_CHECKING:
     from droidw.graph.store import KeyframeStore
 
 __all__ = ["Path"]
+
+# By how much, in logarithms, an inverse depth may change at most where a path goes on beyond what
+# was found.
+_FARTHEST = 1.0
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,27 @@ class Path:
             damping=self.damping.flip(0),
             full=self.full[::-1],
         )
+
+    def beyond(self, before: Path, share: float) -> Path:
+        """A path that goes on from this one as it has come from `before`.
+
+        Motions between keyframes go on as twists, inverse depths by their ratios.
+
+        Args:
+            before: of the same keyframes. share: how far to go, of the way from there to here.
+        """
+        motions, earlier = self._motions(), before._motions()
+        onward = mul(exp(share * log(mul(motions, inv(earlier)))), motions)
+        T_cw = [self.T_cw[0]]
+        for motion in onward:
+            T_cw.append(mul(motion, T_cw[-1]))
+        grown = (self.disps / before.disps).log().mul(share).clamp(-_FARTHEST, _FARTHEST)
+        disps = self.disps * grown.nan_to_num(0.0).exp()
+        return replace(self, T_cw=torch.stack(T_cw), disps=disps)
+
+    def _motions(self) -> Tensor:
+        """From each keyframe to the next, [N-1,7]."""
+        return mul(self.T_cw[1:], inv(self.T_cw[:-1]))
 
     def write_to(self, store: KeyframeStore) -> None:
         """Let a store of the same keyframes have this."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -143,17 +144,21 @@ class Settled:
         again: agreement of the way there, measured once more before both are compared.
         adjusted: agreement after each further global adjustment, or what it fails with.
         stopped: whether the run is to end, once the way back is found.
+        mark: of the depths of the way back. halves: whether further adjustments halve what all
+            inverse depths are off 1, in logarithms.
     Attributes:
         learned: for each global adjustment after the way back, whether uncertainty was to learn.
         passes: of each of these, all without the wide kernel.
         priors: how much steady motion counted in each of these.
+        begun: mean logarithm of the inverse depths from which each of these set out.
     """
 
     def __init__(self, optimiser, config, monkeypatch, found, agreement=0.5, **more):
         self.asked, self.learned, self.passes, self.compared = 0, [], [], 0
-        self.priors = []
+        self.priors, self.begun = [], []
         self.more = {"piece": (), "holds": True, "again": agreement, "adjusted": 0.7} | more
-        self.found = bent(optimiser.store, found) if isinstance(found, float) else found
+        mark = self.more.get("mark", 1.0)
+        self.found = bent(optimiser.store, found, mark) if isinstance(found, float) else found
         monkeypatch.setattr(module, "track_backwards", self.track)
         monkeypatch.setattr(module, "support", self.support)
         monkeypatch.setattr(module.Backend, "run", lambda backend, tell: self.adjust(backend, tell))
@@ -188,6 +193,10 @@ class Settled:
         self.passes.append(backend.config.backend.passes)
         self.learned.append(backend.config.schedule["global"].learn)
         self.priors.append(backend.motion_prior)
+        disps = backend.optimiser.store.disps
+        self.begun.append(float(disps.log().mean()))
+        if self.more.get("halves"):
+            disps.sqrt_()
         if isinstance(self.more["adjusted"], Exception):
             raise self.more["adjusted"]
         for done in (1, 2):
@@ -256,6 +265,22 @@ def test_learning_and_steady_motion_share_adjustments(
     made = Settled(optimiser, config, monkeypatch, 0.6)
     assert (made.kept.agreement, made.kept.backwards) == (0.6, 1.0)
     assert (made.learned, made.priors) == (turns * [learn], turns * [prior])
+
+
+@pytest.mark.parametrize(
+    ("beyond", "begun"),
+    [
+        (2.0, [1.0, 0.5, -0.25, -0.125, -0.0625]),
+        (1.0, [1.0, 0.5, 0.0, 0.0, 0.0]),
+        (0.0, [1.0, 0.5, 0.25, 0.125, 0.0625]),
+    ],
+)
+def test_after_two_turns_the_next_sets_out_beyond_them(
+    optimiser, config, monkeypatch, beyond, begun
+):
+    config.backend.turns, config.backend.beyond = 5, beyond
+    made = Settled(optimiser, config, monkeypatch, 0.6, mark=math.e, halves=True)
+    assert made.begun == pytest.approx(begun, rel=1e-5, abs=1e-6)
 
 
 def test_nothing_is_done_that_is_not_asked_for(optimiser, config, monkeypatch):

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import torch
 
+from droidw.config.schema import DroidwConfig
 from droidw.geometry.camera import Grid
-from droidw.run.again import Hidden, rejection, to_hide
+from droidw.run.again import Hidden, denser, rejection, to_hide
 from droidw.run.drive import _Run
 from droidw.slam.backend import Backend
 from droidw.slam.diagnosis import Diagnosis
@@ -96,6 +97,16 @@ def test_the_second_outcome_stays_unless_it_agrees_much_less_or_is_shorter():
     assert "50 %" in rejection(outcome(0.60), outcome(0.50))
     assert rejection(outcome(0.60), outcome(float("nan")))
     assert "18 of 26 frames" in rejection(outcome(0.60, 26), outcome(0.70, 18))
+
+
+@pytest.mark.parametrize(("wanted", "threshold"), [(0.8, 0.8), (0.0, 1.2), (1.5, 1.2)])
+def test_the_second_time_has_more_keyframes_if_asked_for(wanted, threshold):
+    config = DroidwConfig()
+    config.motion_filter.threshold, config.frontend.again_motion = 1.2, wanted
+    second = denser(config)
+    assert second.motion_filter.threshold == threshold
+    assert config.motion_filter.threshold == 1.2
+    assert second.backend is config.backend
 
 
 def closing(system, share=0.4):

@@ -34,7 +34,7 @@ from droidw_plugins.correspondence._flow_motion import picture_motion
 from droidw_plugins.correspondence._flow_polish import polished
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
-from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Kept, Track
+from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Found, Kept, Track
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Grid
@@ -58,7 +58,8 @@ _SAME_START = 0.15
 _SEEDED = 1.5
 _NEAR_SCALE = 2
 _CLEARLY = 1.05
-# Checked pairs kept for the next session that asks for them: some forty kilobytes each.
+# Checked pairs kept for the next session that asks for them, and what was found between whole
+# pictures: some forty kilobytes each.
 _PAIRS = 4_000
 
 
@@ -80,6 +81,7 @@ class FlowCorrespondence:
         self._grid: Kept[_Pair, Array] = Kept(_GRID_FIELDS)
         self._seeds = SeedBook(options.seeds)
         self._pairs: Kept[tuple[Hashable, ...], tuple[Edge, Edge]] = Kept(_PAIRS)
+        self._plain: Kept[tuple[Hashable, ...], tuple[Found, Found]] = Kept(_PAIRS)
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
         """Grey image, less what the user's mask covers, and its structure at the cells."""
@@ -237,22 +239,50 @@ class FlowCorrespondence:
             for edge, start in zip(known, (start_ab, start_ba), strict=True)
         ):
             return replace(known[0]), replace(known[1])
-        ab, ba = self._started(a, b, start_ab, fine), self._started(b, a, start_ba, fine)
         starts = start_ab, start_ba
-        both = self._checked_both((c, d), (a, b), (ab, ba), starts)
-        if again:
-            ab, ba = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
+        flows, found = self._whole((a, b), starts, fine, kept=again and not self.options.turn_reach)
+        both = self._checked_both((c, d), found)
+        if flows is None or again:
+            flows = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
             share = self.options.bridged_share
-            there, back = self._checked_both((c, d), (c, d), (ab, ba), starts)
+            there, back = self._checked_both((c, d), self._found_both((c, d), flows, starts))
             both = (
                 surer(both[0], there, c.bridged, share),
                 surer(both[1], back, d.bridged, share),
             )
         if seeded:
             seeds = self._seeds.between(a, b, c.bridged, d.bridged)
-            both = self._seeded(seeds, (c, d), (ab, ba), both, fine)
+            both = self._seeded(seeds, (c, d), flows, both, fine)
         self._pairs.put(key, both)
         return replace(both[0]), replace(both[1])
+
+    def _whole(
+        self,
+        frames: tuple[FlowFrame, FlowFrame],
+        starts: tuple[Array | None, Array | None],
+        fine: bool,
+        kept: bool,
+    ) -> tuple[tuple[Array, Array] | None, tuple[Found, Found]]:
+        """Flow there and back between whole pictures, and what it comes to at the cells.
+
+        What is bridged changes with every look at what moves, and this does not.
+
+        Args:
+            kept: the cells are all that is wanted, so those of an earlier session will do; flow is
+                None then.
+        """
+        a, b = frames
+        key = (a.key, b.key, fine)
+        known = self._plain.get(key) if kept else None
+        if known is not None and all(
+            _close(found.started, start) for found, start in zip(known, starts, strict=True)
+        ):
+            return None, known
+        flows = self._started(a, b, starts[0], fine), self._started(b, a, starts[1], fine)
+        found = self._found_both(frames, flows, starts)
+        if kept:
+            self._plain.put(key, found)
+        return flows, found
 
     def _seeded(
         self,
@@ -275,7 +305,7 @@ class FlowCorrespondence:
             return edges
         ab, ba = self._search(a, b, ab, fine, near=True), self._search(b, a, ba, fine, near=True)
         starts = edges[0].started, edges[1].started
-        there, back = self._checked_both(frames, frames, (ab, ba), starts)
+        there, back = self._checked_both(frames, self._found_both(frames, (ab, ba), starts))
         return (
             surer(edges[0], there, a.bridged, clearly=_CLEARLY),
             surer(edges[1], back, b.bridged, clearly=_CLEARLY),
@@ -318,41 +348,44 @@ class FlowCorrespondence:
             self._raster = pixel_grid(height, width).numpy()
         return self._raster
 
-    def _checked_both(
+    def _found_both(
         self,
         frames: tuple[FlowFrame, FlowFrame],
-        searched: tuple[FlowFrame, FlowFrame],
         flows: tuple[Array, Array],
         starts: tuple[Array | None, Array | None],
-    ) -> tuple[Edge, Edge]:
-        """Both edges between these frames, whose flow there and back was `searched` in pictures."""
+    ) -> tuple[Found, Found]:
+        """What flow there and back between these frames comes to at the cells of both."""
         (a, b), (ab, ba) = frames, flows
-        return (
-            self._checked(a, searched, ab, ba, starts[0]),
-            self._checked(b, searched[::-1], ba, ab, starts[1]),
-        )
+        return self._found(a, b, ab, ba, starts[0]), self._found(b, a, ba, ab, starts[1])
 
-    def _checked(
-        self,
-        a: FlowFrame,
-        searched: tuple[FlowFrame, FlowFrame],
-        ab: Array,
-        ba: Array,
-        started: Array | None,
-    ) -> Edge:
-        """Edge from `a`, whose flow there and back was `searched` between these pictures."""
+    def _found(
+        self, a: FlowFrame, b: FlowFrame, ab: Array, ba: Array, started: Array | None
+    ) -> Found:
         moved = sample(ab, a.centres)
-        there = a.centres + moved
-        back = sample(ba, there, outside=1e4)
-        across, along = trust(moved + back, a.normal, self.options)
+        apart = moved + sample(ba, a.centres + moved, outside=1e4)
+        alike = None
         if self.options.likeness > 0:
             pixels = self._pixels(*a.grey.shape)
-            alike = likeness(*searched, ab, pixels, self.options.likeness)
-            across, along = across * alike, along * alike
-        normal = turned(a, ab, self.options.turn_reach)
+            alike = likeness(a, b, ab, pixels, self.options.likeness)
+        return Found(moved, apart, alike, ab if self.options.turn_reach else None, started)
+
+    def _checked_both(
+        self, frames: tuple[FlowFrame, FlowFrame], found: tuple[Found, Found]
+    ) -> tuple[Edge, Edge]:
+        """Both edges between these frames, from what was found there and back."""
+        return self._checked(frames[0], found[0]), self._checked(frames[1], found[1])
+
+    def _checked(self, a: FlowFrame, found: Found) -> Edge:
+        """Edge from `a`, by the structure of that frame."""
+        across, along = trust(found.apart, a.normal, self.options)
+        if found.alike is not None:
+            across, along = across * found.alike, along * found.alike
+        normal = None
+        if found.flow is not None:
+            normal = turned(a, found.flow, self.options.turn_reach)
         confidence = information(a, across, along, self.options, normal)
-        target = ((there - self.offset) / self.stride).astype(np.float32)
-        return Edge(target, confidence, started)
+        target = ((a.centres + found.moved - self.offset) / self.stride).astype(np.float32)
+        return Edge(target, confidence, found.started)
 
     def map(self, jobs: list[Callable[[], Any]]) -> list[Any]:
         """Run jobs on the pool, results in order."""

@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Array", "Edge", "FlowFrame", "Kept", "Track"]
+__all__ = ["Array", "Edge", "FlowFrame", "Found", "Kept", "Track"]
 
 Array = npt.NDArray[np.float32]
 Key = TypeVar("Key", bound=Hashable)
@@ -60,6 +60,25 @@ class FlowFrame:
     def sharp(self) -> npt.NDArray[np.uint8]:
         """The picture [H,W] before it was softened."""
         return self.grey if self.unsoftened is None else self.unsoftened
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search there and back comes to at the cells of one frame.
+
+    Attributes:
+        moved: [h,w,2] displacement, pixels.
+        apart: [h,w,2] where the way there and back ends, seen from its start, pixels.
+        alike: [h,w] in [0,1], `likeness`; None where it is not asked for.
+        flow: [H,W,2] pixels, where lines that turn are to be followed; else None.
+        started: [h,w,2] targets from which the search started; None: free.
+    """
+
+    moved: Array
+    apart: Array
+    alike: Array | None
+    flow: Array | None
+    started: Array | None
 
 
 @dataclass
