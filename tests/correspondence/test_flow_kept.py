@@ -1,0 +1,92 @@
+"""Searches between whole pictures are kept while what is taken out of them changes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from droidw.geometry.camera import Grid
+from droidw_plugins.correspondence._flow_mask import bridge
+
+H, W = 120, 160
+
+
+@pytest.fixture
+def pair(frame):
+    """`pair(part)`: two encoded pictures, the second moved by 5 pixels."""
+
+    def call(part):
+        y, x = np.mgrid[:H, :W].astype(np.float32)
+        grid = Grid.of(H, W, part.stride, part.offset)
+
+        def moved(by):
+            waves = np.sin((x - by) / 5 + y / 9) + np.sin((x - by) / 11 - y / 6)
+            return (128 + 40 * waves).astype(np.float32)
+
+        return [part.encode(frame(k, moved(5 * k)), grid) for k in range(2)]
+
+    return call
+
+
+def ask(part, frames, columns, start=None):
+    """Both edges where uncertainty closes the first columns of both pictures."""
+    gate = np.ones(frames[0].normal.shape[:2], np.float32)
+    gate[:, :columns] = 0.0
+    without = tuple(bridge(f, gate, 0.5, 7, part.options.blur) for f in frames)
+    return part.both_ways(*frames, start, start, fine=True, bridged=without)
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """Starts of all searches that are made of `part`: `searches(part)`."""
+
+    def watch(part):
+        made, search = [], part._search
+
+        def searched(a, b, start=None, *rest, **more):
+            made.append((a.bridged is None, start))
+            return search(a, b, start, *rest, **more)
+
+        monkeypatch.setattr(part, "_search", searched)
+        return made
+
+    return watch
+
+
+@pytest.mark.parametrize("turn_reach", [0, 8])
+def test_what_it_keeps_is_what_a_new_search_finds(operator, pair, turn_reach):
+    part = operator(turn_reach=turn_reach)
+    frames = pair(part)
+    ask(part, frames, 4)
+    found = ask(part, frames, 6)
+    fresh = operator(turn_reach=turn_reach)
+    alone = ask(fresh, pair(fresh), 6)
+    for one, other in zip(found, alone, strict=True):
+        assert np.array_equal(one.target, other.target)
+        assert np.array_equal(one.confidence, other.confidence)
+
+
+def test_other_masks_search_only_what_they_leave(operator, pair, searches):
+    part = operator()
+    frames, made = pair(part), searches(part)
+    ask(part, frames, 4)
+    assert [whole for whole, _ in made] == [True, True, False, False]
+    made.clear()
+    ask(part, frames, 6)
+    assert [whole for whole, _ in made] == [False, False]
+    made.clear()
+    ask(part, frames, 6)
+    assert made == []
+
+
+def test_another_start_is_another_search(operator, pair, searches):
+    part = operator()
+    frames, made = pair(part), searches(part)
+    start = ((frames[0].centres - part.offset) / part.stride).astype(np.float32)
+    ask(part, frames, 4, start)
+    made.clear()
+    ask(part, frames, 6, start + np.float32(0.05))
+    assert [whole for whole, _ in made] == [False, False]
+    made.clear()
+    ask(part, frames, 8, start + np.float32(1.0))
+    assert [whole for whole, _ in made] == [True, True, False, False]
