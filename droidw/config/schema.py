@@ -171,12 +171,6 @@ class FrontendConfig:
         ge=0,
         le=1,
     )
-    again_motion: float = opt(
-        0.8,
-        "`motion_filter.threshold` of the second time, where it is less: what little is left to "
-        "see is seen in more keyframes (0: as the first time)",
-        ge=0,
-    )
 
 
 @dataclass

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from droidw.slam.records import Outcome
     from droidw.slam.system import SlamSystem
 
-__all__ = ["Hidden", "denser", "rejection", "to_hide"]
+__all__ = ["Hidden", "rejection", "second_time", "to_hide"]
 
 _Mask = npt.NDArray[np.bool_]
 
@@ -86,12 +86,9 @@ def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden | None
     return hidden if hidden.share >= _FEW else None
 
 
-def denser(config: DroidwConfig) -> DroidwConfig:
-    """The configuration of the second time, in which less motion makes a keyframe."""
-    wanted, threshold = config.frontend.again_motion, config.motion_filter.threshold
-    if not 0 < wanted < threshold:
-        return config
-    return replace(config, motion_filter=replace(config.motion_filter, threshold=wanted))
+def second_time(config: DroidwConfig) -> DroidwConfig:
+    """The configuration of the second time, which is the last."""
+    return replace(config, frontend=replace(config.frontend, again_below=0.0))
 
 
 def rejection(first: Outcome, second: Outcome) -> str:

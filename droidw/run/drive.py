@@ -23,7 +23,7 @@ from droidw.io.prefetch import prefetch
 from droidw.io.tum import write_tum
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
-from droidw.run.again import Hidden, denser, rejection, to_hide
+from droidw.run.again import Hidden, rejection, second_time, to_hide
 from droidw.run.cameras import choose_camera, open_masks
 from droidw.run.folder import listed, prepare, withdraw, write_json, write_text
 from droidw.run.machine import run_device, settle
@@ -154,7 +154,7 @@ class _Run:
 
         def build(hidden: Hidden | None) -> SlamSystem:
             return SlamSystem(
-                self.config if hidden is None else denser(self.config),
+                self.config if hidden is None else second_time(self.config),
                 self._build(),
                 rectify.camera,
                 self.device,

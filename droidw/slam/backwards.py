@@ -174,8 +174,10 @@ class _SecondLook:
         options = self.config.backend
         # What agrees with new weights is nothing to compare with what agreed before.
         agreement = self.kept.agreement
+        # Footage that is to be tracked once more needs masks for that, and no better path.
+        again = doubtful(agreement, self.config.frontend.again_below)
         steps = [self.kept]
-        for _ in range(options.turns):
+        for _ in range(1 if again else options.turns):
             start = self.kept
             if len(steps) == 3 and options.beyond > 0:
                 start, steps = self.kept.beyond(steps[1], options.beyond), []

@@ -65,7 +65,7 @@ def optimiser(truth, stored):
 def config():
     """Of a run that doubts all; uncertainty does not learn here, as there is none."""
     made = DroidwConfig(camera=CameraConfig(refine_focal=False))
-    made.frontend = replace(made.frontend, warmup=WARM)
+    made.frontend = replace(made.frontend, warmup=WARM, again_below=0.0)
     made.backend = BackendConfig(passes=[1, 1], backwards_below=1.0, turns=2)
     return made
 
@@ -281,6 +281,15 @@ def test_after_two_turns_the_next_sets_out_beyond_them(
     config.backend.turns, config.backend.beyond = 5, beyond
     made = Settled(optimiser, config, monkeypatch, 0.6, mark=math.e, halves=True)
     assert made.begun == pytest.approx(begun, rel=1e-5, abs=1e-6)
+
+
+@pytest.mark.parametrize(("below", "turns"), [(0.65, 1), (0.55, 4)])
+def test_one_turn_is_enough_for_what_is_tracked_once_more(
+    optimiser, config, monkeypatch, below, turns
+):
+    config.backend.turns, config.frontend.again_below = 4, below
+    made = Settled(optimiser, config, monkeypatch, 0.6)
+    assert made.learned == turns * [True]
 
 
 def test_nothing_is_done_that_is_not_asked_for(optimiser, config, monkeypatch):

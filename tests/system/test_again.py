@@ -14,7 +14,7 @@ import torch
 
 from droidw.config.schema import DroidwConfig
 from droidw.geometry.camera import Grid
-from droidw.run.again import Hidden, denser, rejection, to_hide
+from droidw.run.again import Hidden, rejection, second_time, to_hide
 from droidw.run.drive import _Run
 from droidw.slam.backend import Backend
 from droidw.slam.diagnosis import Diagnosis
@@ -99,13 +99,11 @@ def test_the_second_outcome_stays_unless_it_agrees_much_less_or_is_shorter():
     assert "18 of 26 frames" in rejection(outcome(0.60, 26), outcome(0.70, 18))
 
 
-@pytest.mark.parametrize(("wanted", "threshold"), [(0.8, 0.8), (0.0, 1.2), (1.5, 1.2)])
-def test_the_second_time_has_more_keyframes_if_asked_for(wanted, threshold):
+def test_there_is_no_third_time():
     config = DroidwConfig()
-    config.motion_filter.threshold, config.frontend.again_motion = 1.2, wanted
-    second = denser(config)
-    assert second.motion_filter.threshold == threshold
-    assert config.motion_filter.threshold == 1.2
+    second = second_time(config)
+    assert second.frontend.again_below == 0.0
+    assert config.frontend.again_below > 0.0
     assert second.backend is config.backend
 
 
