@@ -34,7 +34,15 @@ from droidw_plugins.correspondence._flow_motion import picture_motion
 from droidw_plugins.correspondence._flow_polish import polished
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
-from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame, Found, Kept, Track
+from droidw_plugins.correspondence._flow_types import (
+    Array,
+    Edge,
+    FlowFrame,
+    Found,
+    Kept,
+    Track,
+    close_starts,
+)
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Grid
@@ -49,9 +57,6 @@ _FULL_FIELDS = 64
 _TRACKED = 0.1
 # Grid flows kept for the filler: some ten kilobytes each.
 _GRID_FIELDS = 20_000
-# Median distance of two starts, in cells, that lead to the same result: a search goes on from the
-# coarsest level, where a pixel is little.
-_SAME_START = 0.15
 # Pixels between a seed and the flow that was found for which a search sets out from the seeds; the
 # coarsest level of that search, on which a pixel is four, and how many times as sure a match of it
 # has to be.
@@ -232,10 +237,10 @@ class FlowCorrespondence:
         """
         c, d = bridged
         again = c.bridged is not None or d.bridged is not None
-        key = (a.key, b.key, fine, seeded, _bits(c), _bits(d))
+        key = (a.key, b.key, fine, seeded, c.taken_out, d.taken_out)
         known = self._pairs.get(key)
         if known is not None and all(
-            _close(edge.started, start)
+            close_starts(edge.started, start)
             for edge, start in zip(known, (start_ab, start_ba), strict=True)
         ):
             return replace(known[0]), replace(known[1])
@@ -275,7 +280,7 @@ class FlowCorrespondence:
         key = (a.key, b.key, fine)
         known = self._plain.get(key) if kept else None
         if known is not None and all(
-            _close(found.started, start) for found, start in zip(known, starts, strict=True)
+            close_starts(found.started, start) for found, start in zip(known, starts, strict=True)
         ):
             return None, known
         flows = self._started(a, b, starts[0], fine), self._started(b, a, starts[1], fine)
@@ -392,15 +397,3 @@ class FlowCorrespondence:
         if len(jobs) < 2:
             return [job() for job in jobs]
         return list(self._pool.map(lambda job: job(), jobs))
-
-
-def _bits(frame: FlowFrame) -> bytes | None:
-    """What tells bridges over the same frame apart."""
-    return None if frame.bridged is None else np.packbits(frame.bridged).tobytes()
-
-
-def _close(one: Array | None, other: Array | None) -> bool:
-    """Whether two searches start from about the same place: both free, or within a pixel or so."""
-    if one is None or other is None:
-        return one is other
-    return bool(np.median(np.abs(one - other)) < _SAME_START)

@@ -12,12 +12,15 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Array", "Edge", "FlowFrame", "Found", "Kept", "Track"]
+__all__ = ["Array", "Edge", "FlowFrame", "Found", "Kept", "Track", "close_starts"]
 
 Array = npt.NDArray[np.float32]
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 
+# Median distance of two starts, in cells, that lead to the same result: a search goes on from the
+# coarsest level, where a pixel is little.
+_SAME_START = 0.15
 # Frames that may be missing before the motion so far is forgotten.
 _LONGEST_GAP = 3
 
@@ -55,6 +58,11 @@ class FlowFrame:
     def __post_init__(self) -> None:
         cover = 0 if self.covered is None else zlib.crc32(np.packbits(self.covered).tobytes())
         object.__setattr__(self, "key", (self.index, cover))
+
+    @property
+    def taken_out(self) -> bytes | None:
+        """What tells bridges over the same frame apart."""
+        return None if self.bridged is None else np.packbits(self.bridged).tobytes()
 
     @property
     def sharp(self) -> npt.NDArray[np.uint8]:
@@ -158,3 +166,10 @@ class Kept(Generic[Key, Value]):
             self._values[key] = value
             while len(self._values) > self._most:
                 self._values.popitem(last=False)
+
+
+def close_starts(one: Array | None, other: Array | None) -> bool:
+    """Whether two searches start from about the same place: both free, or within a pixel or so."""
+    if one is None or other is None:
+        return one is other
+    return bool(np.median(np.abs(one - other)) < _SAME_START)
