@@ -41,7 +41,7 @@ from droidw_plugins.correspondence._flow_types import (
     Found,
     Kept,
     Track,
-    close_starts,
+    set_out_from,
 )
 
 if TYPE_CHECKING:
@@ -238,23 +238,17 @@ class FlowCorrespondence:
         c, d = bridged
         again = c.bridged is not None or d.bridged is not None
         key = (a.key, b.key, fine, seeded, c.taken_out, d.taken_out)
-        known = self._pairs.get(key)
-        if known is not None and all(
-            close_starts(edge.started, start)
-            for edge, start in zip(known, (start_ab, start_ba), strict=True)
-        ):
-            return replace(known[0]), replace(known[1])
         starts = start_ab, start_ba
-        flows, found = self._whole((a, b), starts, fine, kept=again and not self.options.turn_reach)
-        both = self._checked_both((c, d), found)
-        if flows is None or again:
-            flows = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
+        known = self._pairs.get(key)
+        if known is not None and set_out_from(known, starts):
+            return replace(known[0]), replace(known[1])
+        whole = self._whole((a, b), starts, fine) if again else None
+        flows = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
+        both = self._checked_both((c, d), self._found_both((c, d), flows, starts))
+        if whole is not None:
+            there, back = self._checked_both((c, d), whole)
             share = self.options.bridged_share
-            there, back = self._checked_both((c, d), self._found_both((c, d), flows, starts))
-            both = (
-                surer(both[0], there, c.bridged, share),
-                surer(both[1], back, d.bridged, share),
-            )
+            both = surer(there, both[0], c.bridged, share), surer(back, both[1], d.bridged, share)
         if seeded:
             seeds = self._seeds.between(a, b, c.bridged, d.bridged)
             both = self._seeded(seeds, (c, d), flows, both, fine)
@@ -266,28 +260,21 @@ class FlowCorrespondence:
         frames: tuple[FlowFrame, FlowFrame],
         starts: tuple[Array | None, Array | None],
         fine: bool,
-        kept: bool,
-    ) -> tuple[tuple[Array, Array] | None, tuple[Found, Found]]:
-        """Flow there and back between whole pictures, and what it comes to at the cells.
+    ) -> tuple[Found, Found]:
+        """What a search there and back between whole pictures comes to at the cells.
 
-        What is bridged changes with every look at what moves, and this does not.
-
-        Args:
-            kept: the cells are all that is wanted, so those of an earlier session will do; flow is
-                None then.
+        It is kept: what is bridged changes with every look at what moves, and this does not.
         """
         a, b = frames
         key = (a.key, b.key, fine)
-        known = self._plain.get(key) if kept else None
-        if known is not None and all(
-            close_starts(found.started, start) for found, start in zip(known, starts, strict=True)
-        ):
-            return None, known
+        known = self._plain.get(key)
+        if known is not None and set_out_from(known, starts):
+            return known
         flows = self._started(a, b, starts[0], fine), self._started(b, a, starts[1], fine)
         found = self._found_both(frames, flows, starts)
-        if kept:
+        if not self.options.turn_reach:  # with the flow itself it would be too large
             self._plain.put(key, found)
-        return flows, found
+        return found
 
     def _seeded(
         self,

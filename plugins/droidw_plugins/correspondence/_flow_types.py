@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Array", "Edge", "FlowFrame", "Found", "Kept", "Track", "close_starts"]
+__all__ = ["Array", "Edge", "FlowFrame", "Found", "Kept", "Track", "set_out_from"]
 
 Array = npt.NDArray[np.float32]
 Key = TypeVar("Key", bound=Hashable)
@@ -168,8 +168,14 @@ class Kept(Generic[Key, Value]):
                 self._values.popitem(last=False)
 
 
-def close_starts(one: Array | None, other: Array | None) -> bool:
-    """Whether two searches start from about the same place: both free, or within a pixel or so."""
+def set_out_from(
+    known: tuple[Edge | Found, Edge | Found], starts: tuple[Array | None, Array | None]
+) -> bool:
+    """Whether searches both ways began at about these starts: free as they, or within a pixel."""
+    return all(_close(one.started, start) for one, start in zip(known, starts, strict=True))
+
+
+def _close(one: Array | None, other: Array | None) -> bool:
     if one is None or other is None:
         return one is other
     return bool(np.median(np.abs(one - other)) < _SAME_START)
