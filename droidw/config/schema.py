@@ -208,6 +208,14 @@ class BackendConfig:
         True,
         "of the way that agrees less there and back, take the pieces in which more agrees",
     )
+    restarts: int = opt(
+        1,
+        "times that pieces of what was kept of the way back set out anew from a steady motion, "
+        "where that explains far more of the points that correspondence matches by their "
+        "descriptors",
+        ge=0,
+        le=4,
+    )
     relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
     turns: int = opt(
         3,

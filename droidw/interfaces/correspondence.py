@@ -108,6 +108,11 @@ class Correspondence(Protocol):
     measures (`flow`) computes an edge once, and again when the prediction has moved away from
     where it started. Both are the same to the core.
 
+    It may besides have `matched_points(a, b, gate_a, gate_b) -> [n,4]`: points x, y of the picture
+    of payload `a` and where they lie in that of `b`, pixels of the working size, found without any
+    prediction and outside what the gates [h,w] (arrays in [0,1]) close. Where a path is in doubt,
+    they tell pieces of it that have settled in the wrong place (`backend.restarts`).
+
     Attributes:
         stride, offset: the grid: cell (x, y) lies at pixel `stride * (x, y) + offset`.
     """

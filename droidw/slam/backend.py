@@ -78,7 +78,7 @@ class Backend:
                 store.disps.div_(mean)
                 store.T_cw[:, :3].mul_(mean)
             graph = FactorGraph(store.grid.height, store.grid.width, store.device)
-            graph.add(self._edges())
+            graph.add(self.edges())
             if len(graph) < 3:
                 return 0
             session = self.optimiser.parts.correspondence.session("global")
@@ -146,7 +146,15 @@ class Backend:
             if fine is not None:
                 info.disp_full = fine.float().cpu().numpy()
 
-    def _edges(self) -> list[tuple[int, int]]:
+    def narrowing(self) -> list[SolverConfig]:
+        """Solvers for what is far off, one after the other: their kernel narrows."""
+        solver, wide = self.config.global_solver, self.config.backend.wide_start
+        widths = (wide, wide, wide**0.5) if solver.cauchy > 0 else ()
+        wider = [replace(solver, cauchy=w * solver.cauchy, cauchy_tuning=0.0) for w in widths]
+        return [*wider, solver]
+
+    def edges(self) -> list[tuple[int, int]]:
+        """Directed edges between keyframes, chosen by how far they are apart now."""
         store, options = self.optimiser.store, self.config.backend
         count = len(store)
         ii, jj = torch.tril_indices(count, count, -1)

@@ -21,9 +21,12 @@ from droidw.slam.doubt import doubtful
 from droidw.slam.frontend import Frontend
 from droidw.slam.optimise import Optimiser
 from droidw.slam.path import Path
+from droidw.slam.restart import contradicted, credit, matched_points, set_out
 from droidw.slam.splice import lead, pieces, spliced, support
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from droidw.config.schema import DroidwConfig
     from droidw.slam.diagnosis import Diagnosis
 
@@ -107,7 +110,9 @@ class _SecondLook:
         options = config.backend
         self._finishes = options.relearn or options.motion_prior > 0
         steps = (1 + options.turns * int(self._finishes)) * sum(options.passes)
-        steps += (1 + int(options.splice)) * sum(options.passes[-_FEW_PASSES:])
+        few = 1 + int(options.splice)
+        few += 2 * min(options.restarts, options.turns) * int(self._finishes)
+        steps += few * sum(options.passes[-_FEW_PASSES:])
         self._total = len(optimiser.store) + steps
 
     def run(self) -> None:
@@ -163,6 +168,44 @@ class _SecondLook:
             part = sum(taken) / len(taken)
             self.kept, self.share = found, abs(self.share - part)
 
+    def _restart(self) -> bool:
+        """Set out anew from a steady motion where points contradict the path, if that leads on.
+
+        Returns:
+            Whether it does.
+        """
+        optimiser, passes = self.optimiser, self.config.backend.passes[-_FEW_PASSES:]
+        self.kept.write_to(optimiser.store)
+        matches = matched_points(optimiser)
+        if matches is None:
+            return False
+        gates = optimiser.gates()
+        motions = contradicted(self.kept, matches, optimiser.store.intrinsics, gates)
+        if not motions:
+            return False
+        known = support(optimiser, self.kept)
+
+        def gain(found: Path) -> Tensor:
+            return credit((self.kept, found), (known, support(optimiser, found)), matches)
+
+        other = set_out(optimiser, self.config, self.kept, motions)
+        found = self._adjusted(other, passes, learn=False)
+        taken = pieces(gain(found))
+        _log.info(
+            "points contradict %d of %d motions between keyframes, %d are set out anew",
+            len(motions),
+            len(taken),
+            sum(taken),
+        )
+        if not any(taken):
+            return False
+        joined = spliced(self.kept, found, taken, gates)
+        found = self._adjusted(joined, passes, learn=False)
+        leads = float(gain(found)[torch.tensor(taken)].sum()) > 0
+        if leads:
+            self.kept = found
+        return leads
+
     def _finish(self) -> None:
         """Adjust the path that is kept while uncertainty learns from it and steady motion counts.
 
@@ -176,16 +219,17 @@ class _SecondLook:
         agreement = self.kept.agreement
         # Footage that is to be tracked once more needs masks for that, and no better path.
         again = doubtful(agreement, self.config.frontend.again_below)
-        steps = [self.kept]
-        for _ in range(1 if again else options.turns):
+        last = self.kept
+        for turn in range(1 if again else options.turns):
+            # What moves is known better with every turn, and so are the points on it.
+            restarted = turn < options.restarts and self._restart()
             start = self.kept
-            if len(steps) == 3 and options.beyond > 0:
-                start, steps = self.kept.beyond(steps[1], options.beyond), []
+            if turn % 3 == 2 and options.beyond > 0 and not restarted:
+                start = self.kept.beyond(last, options.beyond)
             found = self._adjusted(
                 start, options.passes, learn=options.relearn, motion_prior=options.motion_prior
             )
-            self.kept = replace(found, agreement=agreement)
-            steps.append(self.kept)
+            last, self.kept = self.kept, replace(found, agreement=agreement)
 
     def _adjusted(
         self, path: Path, passes: list[int], learn: bool, motion_prior: float = 0.0

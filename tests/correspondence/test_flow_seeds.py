@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from droidw.geometry.camera import Grid
 from droidw_plugins.correspondence._flow_seeds import (
     SeedBook,
     Seeds,
@@ -164,3 +165,19 @@ def test_seeds_lead_out_of_a_wrong_prediction(found):
 def test_seeds_of_one_run_are_those_of_the_next(found):
     one, other = found(seeds_always=True), found(seeds_always=True)
     assert all(torch.equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def test_points_are_told_to_whom_asks_for_them(operator, frame):
+    pictures = [picture(grey) for grey in (marks(), moved(marks()))]
+    part, grid = operator(), Grid.of(HEIGHT, WIDTH, STRIDE, (STRIDE - 1) / 2)
+    a, b = (part.encode(frame(n, p.astype(np.float64)), grid) for n, p in enumerate(pictures))
+    gate = np.ones((grid.height, grid.width), np.float32)
+    points = part.matched_points(a, b, gate, gate)
+    assert len(points) > 40
+    assert (np.abs(points[:, 2:] - points[:, :2] - SHIFT).max(axis=1) < 0.3).mean() > 0.9
+    half = gate.copy()
+    half[:, 8:] = 0.0
+    left = part.matched_points(a, b, half, gate)
+    assert 0 < len(left) < len(points)
+    assert left[:, 0].max() < 64
+    assert operator(seeds=0).matched_points(a, b, gate, gate).shape == (0, 4)

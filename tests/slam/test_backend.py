@@ -152,7 +152,7 @@ def test_near_keyframes_keep_their_edges(broken):
     edges = {}
     for shape in ("square", "diamond"):
         backend, _ = broken(nms_shape=shape)
-        edges[shape] = {(max(e), min(e)) for e in backend._edges()}
+        edges[shape] = {(max(e), min(e)) for e in backend.edges()}
     three_apart = {(k + 3, k) for k in range(COUNT - 3)}
     assert three_apart <= edges["diamond"]
     assert len(three_apart & edges["square"]) < len(three_apart) / 2

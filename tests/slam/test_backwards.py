@@ -359,3 +359,71 @@ def test_it_is_told_how_far_it_is(optimiser, config, splice):
     assert told[: COUNT + 4] == [(k, total) for k in steps]
     assert told[-1] == (total, total)
     assert all(isinstance(event, Progress) for event in heard.events)
+
+
+class Points:
+    """Stand-ins for points that contradict the path in a piece.
+
+    Args:
+        gains: what `credit` says of the intervals of the piece, once for each path that is asked
+            about.
+    """
+
+    def __init__(self, monkeypatch, gains, piece=range(3, 7)):
+        self.gains, self.piece, self.set = list(gains), piece, 0
+        monkeypatch.setattr(module, "matched_points", lambda optimiser: "points")
+        monkeypatch.setattr(module, "contradicted", lambda *_: dict.fromkeys(piece))
+        monkeypatch.setattr(module, "set_out", self.set_out)
+        monkeypatch.setattr(module, "credit", self.credit)
+
+    def set_out(self, optimiser, config, path, motions):
+        self.set += 1
+        k = torch.arange(float(COUNT))[:, None]
+        turn = exp(k * torch.tensor([0.0, 0.0, 0.0, 0.02, 0.0, 0.0]))
+        return replace(path, T_cw=mul(turn, path.T_cw))
+
+    def credit(self, paths, supports, matches):
+        assert matches == "points"
+        gained = torch.zeros(COUNT - 1, dtype=torch.float64)
+        gained[list(self.piece)] = self.gains.pop(0)
+        return gained
+
+
+@pytest.mark.parametrize(
+    ("gains", "kept"), [([1.0, 0.5], True), ([1.0, -0.5], False), ([0.1], False)]
+)
+def test_pieces_that_points_contradict_set_out_anew(optimiser, config, monkeypatch, gains, kept):
+    config.backend.turns = config.backend.restarts = 1
+    points = Points(monkeypatch, gains)
+    made = Settled(optimiser, config, monkeypatch, 0.6)
+    assert (points.set, points.gains) == (1, [])
+    # The first adjustment is of what sets out, the second of the pieces that are taken.
+    assert made.learned == (len(gains) * [False]) + [True]
+    assert made.priors[:-1] == len(gains) * [0.0]
+    assert torch.allclose(optimiser.store.T_cw, made.found.T_cw) != kept
+    assert made.kept.agreement == 0.6
+
+
+def test_pieces_set_out_before_each_of_the_first_turns(optimiser, config, monkeypatch):
+    config.backend.turns, config.backend.restarts = 4, 2
+    points = Points(monkeypatch, [0.1, 0.1])
+    made = Settled(optimiser, config, monkeypatch, 0.6)
+    assert points.set == 2
+    assert made.learned == [False, True, False, True, True, True]
+
+
+@pytest.mark.parametrize(("restarts", "begun"), [(2, -0.5), (3, 0.25)])
+def test_what_has_set_out_anew_is_not_led_beyond(optimiser, config, monkeypatch, restarts, begun):
+    config.backend.turns, config.backend.restarts, config.backend.beyond = 3, restarts, 3.0
+    asked = iter([False, False, True])
+    monkeypatch.setattr(module._SecondLook, "_restart", lambda self: next(asked))
+    made = Settled(optimiser, config, monkeypatch, 0.6, mark=math.e, halves=True)
+    assert made.begun == pytest.approx([1.0, 0.5, begun], rel=1e-5)
+
+
+def test_restarts_are_left_out_where_they_are_not_asked_for(optimiser, config, monkeypatch):
+    config.backend.restarts = 0
+    points = Points(monkeypatch, [])
+    made = Settled(optimiser, config, monkeypatch, 0.6)
+    assert points.set == 0
+    assert made.learned == [True, True]

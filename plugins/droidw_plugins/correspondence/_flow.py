@@ -63,6 +63,8 @@ _GRID_FIELDS = 20_000
 _SEEDED = 1.5
 _NEAR_SCALE = 2
 _CLEARLY = 1.05
+# Gate below which points are left out, where nothing else is.
+_CLOSED = 0.5
 # Checked pairs kept for the next session that asks for them, and what was found between whole
 # pictures: some forty kilobytes each.
 _PAIRS = 4_000
@@ -136,6 +138,14 @@ class FlowCorrespondence:
     def session(self, purpose: Purpose = "window") -> FlowSession:
         """Fresh edge state; flows already measured are shared between sessions."""
         return FlowSession(self, one_way=purpose == "fill", fine=purpose == "global")
+
+    def matched_points(self, a: FlowFrame, b: FlowFrame, gate_a: Array, gate_b: Array) -> Array:
+        """Points matched by their descriptors, but for those on what gates [h,w] close, [n,4]."""
+        if not self.options.seeds:
+            return np.zeros((0, 4), np.float32)
+        below = self.options.bridge or _CLOSED
+        seeds = self._seeds.between(a, b, gate_a < below, gate_b < below)
+        return np.concatenate([seeds.here, seeds.there], axis=1)
 
     # -- measuring -------------------------------------------------------------------------
 
