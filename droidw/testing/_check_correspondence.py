@@ -70,6 +70,7 @@ def correspondence(subject: Subject) -> None:
             f"two operators of one seed answer differently for {label}",
         )
         _motion(subject, part, payloads)
+        _points(subject, part, payloads, grid, (rows, columns))
 
 
 def _refuses(part: Any, frame: Frame, grid: Grid) -> bool:
@@ -249,4 +250,29 @@ def _motion(subject: Subject, part: Any, payloads: list[Any]) -> None:
         still.flow <= near.flow < far.flow,
         f"motion does not grow with the distance of frames: {near.flow:.2f} cells after "
         f"3 frames, {far.flow:.2f} after 6",
+    )
+
+
+def _points(
+    subject: Subject, part: Any, payloads: list[Any], grid: Grid, size: tuple[int, int]
+) -> None:
+    """Points matched without a prediction, where the part has them."""
+    find = getattr(part, "matched_points", None)
+    if find is None:
+        return
+    gate = np.ones((grid.height, grid.width), np.float32)
+    with subject.calling("matched_points"):
+        seen = np.asarray(find(payloads[0], payloads[1], gate, gate))
+        unseen = np.asarray(find(payloads[0], payloads[1], gate, 0 * gate))
+    within = np.array([size[1], size[0], size[1], size[0]])
+    subject.expect(
+        "matched_points",
+        seen.ndim == 2 and seen.shape[1] == 4 and bool(((seen > -1) & (seen < within)).all()),
+        f"points of pictures of {size[1]}x{size[0]} are {seen!r}; due are rows of x, y here and "
+        "x, y there, in pixels of these pictures",
+    )
+    subject.expect(
+        "matched_points",
+        unseen.shape == (0, 4),
+        f"{len(unseen)} points are matched in a picture whose cells are all closed",
     )

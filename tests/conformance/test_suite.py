@@ -375,6 +375,25 @@ def test_correspondence_may_refuse_odd_sizes_but_not_all():
     broken("errors", "correspondence", component(TooChoosy))
 
 
+class Marked(Wrapped):
+    """Matches one point between all pictures."""
+
+    def __init__(self, points):
+        super().__init__(lambda request, update: update)
+        self.points = np.array(points, np.float32)
+
+    def matched_points(self, a, b, gate_a, gate_b):
+        return self.points[: int(min(gate_a.min(), gate_b.min()))]
+
+
+def test_points_lie_in_the_pictures_and_not_where_these_are_closed():
+    conformance.check("correspondence", component(lambda: Marked([[5, 6, 7, 8]])))
+    broken("matched_points", "correspondence", component(lambda: Marked([[5, 6, 999, 8]])))
+    broken("matched_points", "correspondence", component(lambda: Marked([[5, 6]])))
+    seen = type("Seen", (Marked,), {"matched_points": lambda self, a, b, _, __: self.points})
+    broken("matched_points", "correspondence", component(lambda: seen([[5, 6, 7, 8]])))
+
+
 SMALL = READER.options(frames=6, width=64, height=48)
 SHARED = Scene(named_spec("handheld", frames=6, width=64, height=48))
 
