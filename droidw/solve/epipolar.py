@@ -94,7 +94,8 @@ def planar_twin(motions: Tensor, planes: Tensor) -> Tensor:
 
     Direction of motion and normal of the plane change places, and what that adds to the turn is
     taken from it: with X' = R (1 + v m^T) X of points on the plane m^T X = 1, the twin has v and m
-    the other way round, each as long as the other was, and R exp(m x v).
+    the other way round, each as long as the other was, and R exp(m x v). Of its two signs the one is
+    taken by which the plane is in front of the camera.
 
     Args:
         motions: [N,7] from each camera to the next.
@@ -103,6 +104,7 @@ def planar_twin(motions: Tensor, planes: Tensor) -> Tensor:
     R, t = rotation(motions), motions[:, :3]
     v = (R.mT @ t[..., None])[..., 0]
     long = v.norm(dim=1, keepdim=True) / planes.norm(dim=1, keepdim=True).clamp_min(1e-12)
+    long = torch.where(v[:, 2:] < 0, -long, long)
     none = torch.zeros_like(v)
     turned = exp(torch.cat([none, torch.linalg.cross(planes, v)], dim=1))
     kept = torch.cat([none, motions[:, 3:]], dim=1)
@@ -176,18 +178,21 @@ def _changes(motions: Tensor) -> Tensor:
 def _normal_equations(motions: Tensor, matches: PointMatches) -> tuple[Tensor, Tensor]:
     """Of tangent vectors of all motions, [6(N-1),6(N-1)] and [6(N-1)], Gauss-Newton."""
     count, poses = len(motions), led(motions)
-    ii, jj = matches.ii, matches.jj
-    T_ji = mul(poses[jj], inv(poses[ii]))
+    T_ji = mul(poses[matches.jj], inv(poses[matches.ii]))
     r, J = _measured(T_ji, matches.here, matches.there, matches.focal)
     r, J = r / _FAR, J / _FAR
-    whole = torch.zeros(len(r), count, 6, dtype=r.dtype)
-    for k in range(count):
-        rows = torch.nonzero((ii <= k) & (k < jj))[:, 0]
-        after = adjoint(mul(poses[jj[rows]], inv(poses[k + 1])))
-        whole[rows, k] = (J[rows, None] @ after)[:, 0]
-    whole = whole.reshape(len(r), -1)
     kept = 1.0 / (1.0 + r.square())
-    H, g = whole.T @ (kept[:, None] * whole), whole.T @ (kept * r)
+    # All matches between two keyframes see the motions in between alike.
+    pairs, at = torch.unique(matches.ii * (count + 1) + matches.jj, return_inverse=True)
+    ii, jj = pairs // (count + 1), pairs % (count + 1)
+    H_pair = torch.zeros(len(pairs), 6, 6, dtype=r.dtype)
+    H_pair.index_add_(0, at, (kept[:, None] * J)[:, :, None] * J[:, None])
+    g_pair = torch.zeros(len(pairs), 6, dtype=r.dtype).index_add_(0, at, (kept * r)[:, None] * J)
+    k = torch.arange(count)
+    inside = (ii[:, None] <= k) & (k < jj[:, None])
+    seen = adjoint(mul(poses[jj][:, None], inv(poses[1:])[None])) * inside[..., None, None]
+    H = torch.einsum("pkab,pac,plcd->kbld", seen, H_pair, seen).reshape(6 * count, 6 * count)
+    g = torch.einsum("pkab,pa->kb", seen, g_pair).reshape(-1)
 
     # The rotation from one motion to the next is small: its Jacobians are those of a difference.
     e, t = _changes(motions), motions[:, :3]

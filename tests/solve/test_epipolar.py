@@ -203,7 +203,8 @@ def test_the_twin_of_the_twin_is_the_motion():
     T, _, _ = wall()
     motions, planes = between(T), (NORMAL / 2.0).expand(len(T) - 1, 3)
     once = planar_twin(motions, planes)
-    normals = motions[:, :3] / motions[:, :3].norm(dim=1, keepdim=True) / 2.0
+    # in front of the camera, which goes ahead
+    normals = -motions[:, :3] / motions[:, :3].norm(dim=1, keepdim=True) / 2.0
     again = planar_twin(once, normals)
     assert torch.allclose(again, motions, atol=2e-3)
 
