@@ -19,7 +19,14 @@ from droidw.geometry.se3 import adjoint, exp, identity, inv, log, mul, rotation,
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["PointMatches", "disagreement", "epipolar_distance", "led", "planar_twin", "steady_fit"]
+__all__ = [
+    "PointMatches",
+    "disagreement",
+    "epipolar_distance",
+    "led",
+    "planar_twin",
+    "steady_fit",
+]
 
 # Pixels from its epipolar line at which a match counts by half.
 _FAR = 1.0
@@ -94,8 +101,8 @@ def planar_twin(motions: Tensor, planes: Tensor) -> Tensor:
 
     Direction of motion and normal of the plane change places, and what that adds to the turn is
     taken from it: with X' = R (1 + v m^T) X of points on the plane m^T X = 1, the twin has v and m
-    the other way round, each as long as the other was, and R exp(m x v). Of its two signs the one is
-    taken by which the plane is in front of the camera.
+    the other way round, each as long as the other was, and R exp(m x v). Of its two signs it takes
+    the one by which the plane is in front of the camera.
 
     Args:
         motions: [N,7] from each camera to the next.
