@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = [
     "act",
     "adjoint",
+    "chained",
     "exp",
     "from_matrix",
     "identity",
@@ -108,6 +109,14 @@ def mul(A: Tensor, B: Tensor) -> Tensor:
         A, B = A.expand(*shape, 7), B.expand(*shape, 7)
     t = A[..., :3] + _rotate(A[..., 3:], B[..., :3])
     return torch.cat((t, _quat_mul(A[..., 3:], B[..., 3:])), dim=-1)
+
+
+def chained(motions: Tensor, first: Tensor) -> Tensor:
+    """Poses [N,7] that motions [N-1,7], each applied to the pose before, lead to from `first`."""
+    poses = [first]
+    for motion in motions:
+        poses.append(mul(motion, poses[-1]))
+    return torch.stack(poses)
 
 
 def inv(T: Tensor) -> Tensor:

@@ -117,8 +117,7 @@ class Backend:
         """
         solver, last = self.config.global_solver, len(self.config.backend.passes) - 1
         if wide and number == 0:
-            wider = solver.cauchy * self.config.backend.wide_start
-            return replace(solver, cauchy=wider, cauchy_tuning=0.0)
+            return self._wider(self.config.backend.wide_start)
         return replace(solver, cauchy_tuning=0.0) if number == int(wide) < last else solver
 
     def _prior(self, number: int) -> float:
@@ -150,8 +149,12 @@ class Backend:
         """Solvers for what is far off, one after the other: their kernel narrows."""
         solver, wide = self.config.global_solver, self.config.backend.wide_start
         widths = (wide, wide, wide**0.5) if solver.cauchy > 0 else ()
-        wider = [replace(solver, cauchy=w * solver.cauchy, cauchy_tuning=0.0) for w in widths]
-        return [*wider, solver]
+        return [*map(self._wider, widths), solver]
+
+    def _wider(self, times: float) -> SolverConfig:
+        """The solver with a kernel so many times as wide, whatever the residuals."""
+        solver = self.config.global_solver
+        return replace(solver, cauchy=times * solver.cauchy, cauchy_tuning=0.0)
 
     def edges(self) -> list[tuple[int, int]]:
         """Directed edges between keyframes, chosen by how far they are apart now."""

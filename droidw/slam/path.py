@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import Tensor
 
-from droidw.geometry.se3 import exp, inv, log, mul
+from droidw.geometry.se3 import chained, exp, inv, log, mul
 
 if TYPE_CHECKING:
     from droidw.graph.store import KeyframeStore
@@ -67,16 +66,13 @@ class Path:
         Args:
             before: of the same keyframes. share: how far to go, of the way from there to here.
         """
-        motions, earlier = self._motions(), before._motions()
+        motions, earlier = self.motions(), before.motions()
         onward = mul(exp(share * log(mul(motions, inv(earlier)))), motions)
-        T_cw = [self.T_cw[0]]
-        for motion in onward:
-            T_cw.append(mul(motion, T_cw[-1]))
         grown = (self.disps / before.disps).log().mul(share).clamp(-_FARTHEST, _FARTHEST)
         disps = self.disps * grown.nan_to_num(0.0).exp()
-        return replace(self, T_cw=torch.stack(T_cw), disps=disps)
+        return replace(self, T_cw=chained(onward, self.T_cw[0]), disps=disps)
 
-    def _motions(self) -> Tensor:
+    def motions(self) -> Tensor:
         """From each keyframe to the next, [N-1,7]."""
         return mul(self.T_cw[1:], inv(self.T_cw[:-1]))
 

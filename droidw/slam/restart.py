@@ -10,7 +10,6 @@ points gain more than dense matches lose.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 from math import log
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ import numpy as np
 import torch
 
 from droidw.geometry.projective import viewing_rays
-from droidw.geometry.se3 import inv, mul
+from droidw.geometry.se3 import chained, inv, mul
 from droidw.graph.factors import FactorGraph
 from droidw.slam.backend import Backend
 from droidw.slam.path import Path
@@ -65,9 +64,9 @@ def matched_points(optimiser: Optimiser) -> PointMatches | None:
         return None
     gates = optimiser.gates().cpu().numpy()
     found, ends = [], []
-    for i, j in combinations(range(len(store)), 2):
-        if j - i > _GAP:
-            continue
+    count = len(store)
+    near = [(i, j) for i in range(count) for j in range(i + 1, min(i + _GAP + 1, count))]
+    for i, j in near:
         points = find(store.payload(i), store.payload(j), gates[i], gates[j])
         found.append(np.asarray(points, np.float64).reshape(-1, 4))
         ends.append(np.tile((i, j), (len(points), 1)))
@@ -100,7 +99,7 @@ def contradicted(
     for first in range(0, count - _WINDOW + _APART, _APART):
         last = min(first + _WINDOW, count) - 1
         inside = matches.within(first, last, _GAP)
-        if last - first < 2 or not len(inside):
+        if not len(inside):
             continue
         cost = float(disagreement(led(known[first:last]), inside).sum())
         fits = [steady_fit(start[first:last], inside) for start in (known, twins)]
@@ -162,11 +161,10 @@ def set_out(
     graph.add(backend.edges())
     session = optimiser.parts.correspondence.session("global")
     optimiser.measure(graph, session, graph.select(), informed=True, learned=True)
-    T_cw = [path.T_cw[0]]
-    known = mul(path.T_cw[1:], inv(path.T_cw[:-1]))
-    for k, motion in enumerate(known):
-        T_cw.append(mul(motions[k].to(motion) if k in motions else motion, T_cw[-1]))
-    replace(path, T_cw=torch.stack(T_cw)).write_to(store)
+    changed = path.motions()
+    for k, motion in motions.items():
+        changed[k] = motion.to(changed)
+    replace(path, T_cw=chained(changed, path.T_cw[0])).write_to(store)
     phase = replace(config.schedule["global"], learn=False)
     for solver in backend.narrowing():
         optimiser.adjust(graph, graph.select(), phase, solver, first_free=len(store))

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from droidw.geometry.se3 import adjoint, exp, identity, inv, log, mul, rotation, skew
+from droidw.geometry.se3 import adjoint, chained, exp, identity, inv, log, mul, rotation, skew
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -162,10 +162,7 @@ def _as_long(motions: Tensor) -> Tensor:
 
 def led(motions: Tensor) -> Tensor:
     """Poses [N,7] that these motions lead through, from the identity on."""
-    poses = [identity(dtype=motions.dtype)]
-    for motion in motions:
-        poses.append(mul(motion, poses[-1]))
-    return torch.stack(poses)
+    return chained(motions, identity(dtype=motions.dtype))
 
 
 def _energy(motions: Tensor, matches: PointMatches) -> float:
