@@ -10,7 +10,6 @@ points gain more than dense matches lose.
 from __future__ import annotations
 
 from dataclasses import replace
-from math import log
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +21,14 @@ from droidw.graph.factors import FactorGraph
 from droidw.slam.backend import Backend
 from droidw.slam.path import Path
 from droidw.slam.splice import lead
-from droidw.solve.epipolar import PointMatches, disagreement, led, planar_twin, steady_fit
+from droidw.solve.epipolar import (
+    PointMatches,
+    cost_of,
+    disagreement,
+    led,
+    planar_twin,
+    steady_fit,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -41,7 +47,7 @@ _WINDOW, _APART = 15, 5
 # lie within a pixel of it, for what moves is matched as well; and how many must span an interval
 # that is to change.
 _CONTRADICTED, _AT_LEAST = 0.75, 1.0
-_MOST, _NEAR_COST = 0.75, log(2.0)
+_MOST, _NEAR_COST = 0.75, cost_of(1.0)
 _LEAST = 8
 # Rounds in which a plane is fitted to what is seen.
 _ROUNDS = 5

@@ -9,6 +9,7 @@ better, if only as many unknowns are asked of them as they can tell: those of a 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "PointMatches",
+    "cost_of",
     "disagreement",
     "epipolar_distance",
     "led",
@@ -28,8 +30,9 @@ __all__ = [
     "steady_fit",
 ]
 
-# Pixels from its epipolar line at which a match counts by half.
-_FAR = 1.0
+# Pixels from its epipolar line at which a match counts by half: twice what those of corners usually
+# are at the true motion.
+_FAR = 0.2
 # How much of a change from one motion to the next counts as much as a match that far off: radians,
 # share of the mean distance that the camera goes.
 _TURN, _SHARE = 0.0044, 0.05
@@ -89,11 +92,16 @@ def epipolar_distance(T_ji: Tensor, here: Tensor, there: Tensor, focal: float) -
 
 
 def disagreement(T_cw: Tensor, matches: PointMatches) -> Tensor:
-    """What each match costs at these poses, [M]: log(1 + s^2) for s pixels from its line."""
+    """What each match costs at these poses, [M]; see `cost_of`."""
     T = T_cw.double()
     T_ji = mul(T[matches.jj], inv(T[matches.ii]))
     r = epipolar_distance(T_ji, matches.here, matches.there, matches.focal)
     return (r / _FAR).square().log1p()
+
+
+def cost_of(pixels: float) -> float:
+    """What a match costs so far from its epipolar line: log(1 + s^2), s in fifths of a pixel."""
+    return math.log1p((pixels / _FAR) ** 2)
 
 
 def planar_twin(motions: Tensor, planes: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from droidw.geometry.camera import Grid
 from droidw_plugins.correspondence._flow_seeds import (
     SeedBook,
     Seeds,
+    _held,
     coherent,
     detect,
     drawn,
@@ -66,6 +67,31 @@ def test_a_blank_picture_has_no_points_and_matches_nothing():
         assert len(coherent(matched(*pair))) == 0
 
 
+def test_a_corner_is_held_and_a_point_on_a_line_is_not():
+    grey = np.full((HEIGHT, WIDTH), 90.0)
+    grey[40:60, 30:50] = 180.0
+    grey[100:, :] = 180.0  # an edge, with a bend of a pixel in it
+    grey[100, 120:] = 90.0
+    at = np.float32([[30, 40], [49, 59], [120, 100]])
+    assert _held(picture(grey), at).tolist() == [True, True, False]
+    found = detect(picture(marks()), 500)
+    assert found.held.shape == (len(found.at),)
+    assert found.held.mean() > 0.8
+
+
+def test_a_pair_is_held_where_both_of_it_are():
+    a, b = detect(picture(marks()), 500), detect(picture(moved(marks())), 500)
+    whole = matched(replace(a, held=a.held & False), b)
+    assert len(whole) > 60
+    assert not whole.held.any()
+    assert not matched(a, replace(b, held=b.held & False)).held.any()
+    both = matched(replace(a, held=a.held | True), replace(b, held=b.held | True))
+    assert both.held.all()
+    assert np.array_equal(both.turned().held, both.held)
+    some = both.where(np.arange(len(both)) < 5)
+    assert len(some.held) == 5
+
+
 def test_products_of_descriptors_are_exact():
     points = detect(picture(marks()), 500)
     wide = points.descriptor.astype(np.float64)
@@ -77,10 +103,14 @@ def test_products_of_descriptors_are_exact():
     assert np.abs(np.diag(exact) / 255**2 - 1).max() < 0.03
 
 
+def paired(here, there):
+    return Seeds(here, there, np.ones(len(here), bool))
+
+
 def field(count=30):
     random = np.random.default_rng(1)
     here = random.uniform(20, 140, (count, 2)).astype(np.float32)
-    return Seeds(here, here + SHIFT.astype(np.float32))
+    return paired(here, here + SHIFT.astype(np.float32))
 
 
 def test_what_moves_unlike_all_around_it_is_left_out():
@@ -95,7 +125,7 @@ def test_what_moves_unlike_all_around_it_is_left_out():
 
 def test_one_corner_found_many_times_has_no_vote_for_itself():
     here = np.full((9, 2), 50, np.float32) + np.linspace(0, 1, 9, dtype=np.float32)[:, None]
-    assert len(coherent(Seeds(here, here + 5))) == 0
+    assert len(coherent(paired(here, here + 5))) == 0
 
 
 def test_points_on_closed_cells_and_their_border_are_left_out():
@@ -104,14 +134,14 @@ def test_points_on_closed_cells_and_their_border_are_left_out():
     here = np.array([[57, 41], [54, 44], [65, 44], [52, 44], [59, 51]], np.float32)
     elsewhere = np.full_like(here, 150.0)
     expected = [[52, 44], [59, 51]]
-    assert uncovered(Seeds(here, elsewhere), closed, None, STRIDE).here.tolist() == expected
-    assert uncovered(Seeds(elsewhere, here), None, closed, STRIDE).there.tolist() == expected
-    assert len(uncovered(Seeds(here, here), None, None, STRIDE)) == len(here)
+    assert uncovered(paired(here, elsewhere), closed, None, STRIDE).here.tolist() == expected
+    assert uncovered(paired(elsewhere, here), None, closed, STRIDE).there.tolist() == expected
+    assert len(uncovered(paired(here, here), None, None, STRIDE)) == len(here)
 
 
 def test_flow_is_drawn_to_seeds_near_it_and_stays_elsewhere():
     here = np.array([[60, 80], [64, 84]], np.float32)
-    seeds = Seeds(here, here + np.float32([9, 3]))
+    seeds = paired(here, here + np.float32([9, 3]))
     flow = np.full((HEIGHT, WIDTH, 2), (1.0, 0.0), np.float32)
     pulled, off = drawn(flow, seeds)
     assert off == pytest.approx([np.hypot(8, 3)] * 2, rel=1e-5)

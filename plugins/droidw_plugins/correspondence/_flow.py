@@ -140,12 +140,15 @@ class FlowCorrespondence:
         return FlowSession(self, one_way=purpose == "fill", fine=purpose == "global")
 
     def matched_points(self, a: FlowFrame, b: FlowFrame, gate_a: Array, gate_b: Array) -> Array:
-        """Points matched by their descriptors, but for those on what gates [h,w] close, [n,4]."""
+        """Points matched by their descriptors and held in both pictures, [n,4].
+
+        But for those on what gates [h,w] close.
+        """
         if not self.options.seeds:
             return np.zeros((0, 4), np.float32)
         below = self.options.bridge or _CLOSED
         seeds = self._seeds.between(a, b, gate_a < below, gate_b < below)
-        return np.concatenate([seeds.here, seeds.there], axis=1)
+        return np.concatenate([seeds.here, seeds.there], axis=1)[seeds.held]
 
     # -- measuring -------------------------------------------------------------------------
 

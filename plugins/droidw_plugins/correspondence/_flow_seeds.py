@@ -41,6 +41,10 @@ _VOTES = 4
 _AROUND = 80.0
 _ALIKE = 2.0
 _ALIKE_FAR = 0.1
+# Power of the picture along the strongest edge around a point, as a share of that across it, from
+# which on it is held: a point on a line may lie anywhere along it and is usually off by half a
+# pixel, one that is held by a tenth. The Gaussian window in which it is told, pixels.
+_HELD, _HOLDS = 0.1, 3.0
 # Pixels around what is closed whose points may be on its contour.
 _MARGIN = 2
 # How far a seed draws the flow around it, pixels, and how many seeds' worth of staying there is.
@@ -56,29 +60,34 @@ _PAIRS = 20_000
 
 @dataclass(frozen=True)
 class Points:
-    """Points of a picture: `at` [n,2] pixels, `descriptor` [n,128] uint8."""
+    """Points of a picture: `at` [n,2] pixels, `descriptor` [n,128] uint8, [n] which are `held`."""
 
     at: Array
     descriptor: Picture
+    held: Mask
 
 
 @dataclass(frozen=True)
 class Seeds:
-    """Matched points: `here` [n,2] in one picture lie `there` [n,2] in the other, pixels."""
+    """Matched points: `here` [n,2] in one picture lie `there` [n,2] in the other, pixels.
+
+    Those that are `held` [n], in both, do not slip along a line.
+    """
 
     here: Array
     there: Array
+    held: Mask
 
     def __len__(self) -> int:
         return len(self.here)
 
     def where(self, chosen: Mask) -> Seeds:
         """Those of them that are chosen, [n]."""
-        return Seeds(self.here[chosen], self.there[chosen])
+        return Seeds(self.here[chosen], self.there[chosen], self.held[chosen])
 
     def turned(self) -> Seeds:
         """The same from the other picture."""
-        return Seeds(self.there, self.here)
+        return Seeds(self.there, self.here, self.held)
 
 
 class SeedBook:
@@ -122,16 +131,28 @@ def detect(grey: Picture, most: int) -> Points:
     finder: Any = cv2.SIFT.create(most, contrastThreshold=_CONTRAST, edgeThreshold=_ELONGATED)
     found, described = finder.detectAndCompute(larger, None)
     if described is None:
-        return Points(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8))
+        return Points(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros(0, bool))
     at = (np.array([p.pt for p in found], np.float32) + 0.5) / np.float32(_LARGER) - 0.5
     share = described / np.maximum(described.sum(axis=1, keepdims=True), 1.0)
-    return Points(at.astype(np.float32), np.rint(_WHOLE * np.sqrt(share)).astype(np.uint8))
+    at = at.astype(np.float32)
+    return Points(at, np.rint(_WHOLE * np.sqrt(share)).astype(np.uint8), _held(grey, at))
+
+
+def _held(grey: Picture, at: Array) -> Mask:
+    """Which points [n,2] of a picture are held in both directions, [n]."""
+    dx, dy = (cv2.Scharr(grey, cv2.CV_32F, *along, scale=1 / 32) for along in ((1, 0), (0, 1)))
+    xx, yy, xy = (cv2.GaussianBlur(p, (0, 0), _HOLDS) for p in (dx * dx, dy * dy, dx * dy))
+    mean, off = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    height, width = grey.shape
+    x, y = np.rint(at).astype(np.int64).clip(0, (width - 1, height - 1)).T
+    held: Mask = (mean - off > _HELD * (mean + off))[y, x]
+    return held
 
 
 def matched(a: Points, b: Points) -> Seeds:
     """Points that are each other's nearest, and nearer than any other by Lowe's ratio."""
     if not len(a.at) or not len(b.at):
-        return Seeds(a.at[:0], b.at[:0])
+        return Seeds(a.at[:0], b.at[:0], a.held[:0])
     one, other = a.descriptor.astype(np.float32), b.descriptor.astype(np.float32)
     # Descriptors are as long as each other, but for rounding.
     apart = np.float32(_WHOLE**2) - one @ other.T
@@ -143,7 +164,8 @@ def matched(a: Points, b: Points) -> Seeds:
     left[_length(b.at[best][:, None] - b.at) < _ANOTHER] = np.inf
     # Squares of distances, by half.
     sure = distance < _RATIO**2 * left.min(axis=1)
-    return Seeds(a.at[rows[sure]], b.at[best[sure]])
+    rows, best = rows[sure], best[sure]
+    return Seeds(a.at[rows], b.at[best], a.held[rows] & b.held[best])
 
 
 def coherent(seeds: Seeds) -> Seeds:
