@@ -216,6 +216,13 @@ class BackendConfig:
         ge=0,
         le=4,
     )
+    points: float = opt(
+        5.0,
+        "how much the points that correspondence matches by their descriptors count for what was "
+        "kept of the way back: one that is a fifth of a pixel off its epipolar line as much as so "
+        "many matches with a usual residual (0: not at all)",
+        ge=0,
+    )
     relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
     turns: int = opt(
         3,

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from droidw.config.schema import DroidwConfig
     from droidw.slam.diagnosis import Diagnosis
+    from droidw.solve.epipolar import PointMatches
 
 __all__ = ["doubted", "track_backwards"]
 
@@ -79,7 +80,7 @@ def doubted(
         why = str(error) or type(error).__name__
         events.warn(f"tracking the keyframes backwards broke off, the best so far is kept: {why}")
     finally:
-        optimiser.doubtful = False
+        optimiser.doubtful, optimiser.points = False, None
     look.kept.write_to(optimiser.store)
     return replace(found, agreement=look.kept.agreement, backwards=look.share)
 
@@ -168,17 +169,15 @@ class _SecondLook:
             part = sum(taken) / len(taken)
             self.kept, self.share = found, abs(self.share - part)
 
-    def _restart(self) -> bool:
+    def _restart(self, matches: PointMatches) -> bool:
         """Set out anew from a steady motion where points contradict the path, if that leads on.
 
+        Args:
+            matches: of points.
         Returns:
             Whether it does.
         """
         optimiser, passes = self.optimiser, self.config.backend.passes[-_FEW_PASSES:]
-        self.kept.write_to(optimiser.store)
-        matches = matched_points(optimiser)
-        if matches is None:
-            return False
         gates = optimiser.gates()
         motions = contradicted(self.kept, matches, optimiser.store.intrinsics, gates)
         if not motions:
@@ -222,7 +221,11 @@ class _SecondLook:
         last = self.kept
         for turn in range(1 if again else options.turns):
             # What moves is known better with every turn, and so are the points on it.
-            restarted = turn < options.restarts and self._restart()
+            self.kept.write_to(self.optimiser.store)
+            matches = matched_points(self.optimiser)
+            if matches is not None and options.points > 0:
+                self.optimiser.points = matches, options.points
+            restarted = matches is not None and turn < options.restarts and self._restart(matches)
             start = self.kept
             if turn % 3 == 2 and options.beyond > 0 and not restarted:
                 start = self.kept.beyond(last, options.beyond)

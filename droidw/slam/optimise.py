@@ -14,9 +14,10 @@ from droidw.geometry.projective import reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.interfaces.uncertainty import Indices, UncertaintyView
+from droidw.solve.epipolar import PointMatches, epipolar_term
 from droidw.solve.kernel import redescended, usual_square
 from droidw.solve.motion import steady_motion
-from droidw.solve.problem import BAProblem, Report
+from droidw.solve.problem import BAProblem, PoseTerm, Report
 from droidw.solve.weights import gate, opened, residual_weights
 
 if TYPE_CHECKING:
@@ -68,6 +69,9 @@ class Optimiser:
     Attributes:
         begins: uncertainty is to be told what can move before the first search. begun: it was.
         doubtful: correspondence is asked on behalf of a path that is in doubt.
+        points: matched between keyframes of the store, and how much they count in steps that all
+            keyframes have a part in: a fifth of a pixel off its epipolar line, a point counts as
+            much as so many matches with a usual residual. None: not at all.
     """
 
     def __init__(
@@ -93,6 +97,7 @@ class Optimiser:
         )
         self.begun = False
         self.doubtful = False
+        self.points: tuple[PointMatches, float] | None = None
         self.iterations = 0
         self.reports: dict[str, int] = {}
         self.cost = float("nan")
@@ -256,15 +261,27 @@ class Optimiser:
             max_disp=weighting.max_disp or None,
             pairs=edges.pairs,
         )
-        if motion_prior > 0:
-            times = torch.tensor(store.times()[low:], dtype=torch.float64)
-            known = motion_prior * usual_square(problem)
-            problem = replace(problem, pose_term=steady_motion(problem.T_cw, times, known))
+        problem = replace(problem, pose_term=self._known(problem, low, motion_prior))
         step = self.parts.ba.step(redescended(problem, solver))
         self._note(step.report)
         self.cost = step.report.cost_before
         store.T_cw[low:] = step.T_cw
         store.disps[low:] = step.disps
+
+    def _known(self, problem: BAProblem, low: int, motion_prior: float) -> PoseTerm | None:
+        """What is known of the poses from `low` on besides matches."""
+        points = self.points if low == 0 else None
+        if motion_prior <= 0 and points is None:
+            return None
+        usual = usual_square(problem)
+        known = None
+        if motion_prior > 0:
+            times = torch.tensor(self.store.times()[low:], dtype=torch.float64)
+            known = steady_motion(problem.T_cw, times, motion_prior * usual)
+        if points is not None:
+            said = epipolar_term(problem.T_cw, points[0], points[1] * usual)
+            known = said if known is None else known + said
+        return known
 
     def _note(self, report: Report) -> None:
         if report.status != "ok":

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from droidw.geometry.se3 import adjoint, chained, exp, identity, inv, log, mul, rotation, skew
+from droidw.solve.problem import PoseTerm
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,6 +26,7 @@ __all__ = [
     "cost_of",
     "disagreement",
     "epipolar_distance",
+    "epipolar_term",
     "led",
     "planar_twin",
     "steady_fit",
@@ -102,6 +104,32 @@ def disagreement(T_cw: Tensor, matches: PointMatches) -> Tensor:
 def cost_of(pixels: float) -> float:
     """What a match costs so far from its epipolar line: log(1 + s^2), s in fifths of a pixel."""
     return math.log1p((pixels / _FAR) ** 2)
+
+
+def epipolar_term(T_cw: Tensor, matches: PointMatches, weight: float) -> PoseTerm:
+    """The energy `weight * sum log(1 + s^2)` of all matches (`disagreement`), linearised.
+
+    Args:
+        T_cw: [N,7] poses, world to camera. weight: in the units of the energy of `BAProblem`.
+    """
+    T = T_cw.double().to(matches.here.device)
+    ii, jj = matches.ii, matches.jj
+    T_ji = mul(T[jj], inv(T[ii]))
+    r, J_j = _measured(T_ji, matches.here, matches.there, matches.focal)
+    r, J_j = r / _FAR, J_j / _FAR
+    kept = weight / (1.0 + r.square())
+    # exp(w) on the right of T_ji is exp(Ad w) on its left
+    J_i = -torch.einsum("ma,mab->mb", J_j, adjoint(T_ji))
+    gap = jj - ii
+    width = 1 + (int(gap.max()) if len(gap) else 0)
+    band = torch.zeros(len(T) * width, 6, 6, dtype=T.dtype, device=T.device)
+    rhs = torch.zeros(len(T), 6, dtype=T.dtype, device=T.device)
+    for at, J in ((ii, J_i), (jj, J_j)):
+        rhs.index_add_(0, at, -(kept * r)[:, None] * J)
+        band.index_add_(0, at * width, kept[:, None, None] * J[:, :, None] * J[:, None])
+    both = kept[:, None, None] * J_j[:, :, None] * J_i[:, None]
+    band.index_add_(0, jj * width + gap, both)
+    return PoseTerm(band.reshape(len(T), width, 6, 6), rhs).to(T_cw.device)
 
 
 def planar_twin(motions: Tensor, planes: Tensor) -> Tensor:

@@ -48,6 +48,15 @@ class PoseTerm:
         """The same on a device, in float64."""
         return PoseTerm(self.band.to(device, torch.float64), self.rhs.to(device, torch.float64))
 
+    def __add__(self, other: PoseTerm) -> PoseTerm:
+        """Both, on the device of this one."""
+        other = other.to(self.rhs.device)
+        width = max(self.band.shape[1], other.band.shape[1])
+        band = self.band.new_zeros(len(self.rhs), width, 6, 6)
+        for term in (self, other):
+            band[:, : term.band.shape[1]] += term.band
+        return PoseTerm(band, self.rhs + other.rhs)
+
     def energy(self, steps: Tensor) -> Tensor:
         """Of steps [N,6] float64, a scalar; 0 without a step."""
         total = -2.0 * (self.rhs * steps).sum()

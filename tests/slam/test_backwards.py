@@ -150,12 +150,13 @@ class Settled:
         learned: for each global adjustment after the way back, whether uncertainty was to learn.
         passes: of each of these, all without the wide kernel.
         priors: how much steady motion counted in each of these.
+        points: matches of points that counted in each of these, and how much.
         begun: mean logarithm of the inverse depths from which each of these set out.
     """
 
     def __init__(self, optimiser, config, monkeypatch, found, agreement=0.5, **more):
         self.asked, self.learned, self.passes, self.compared = 0, [], [], 0
-        self.priors, self.begun = [], []
+        self.priors, self.begun, self.points = [], [], []
         self.more = {"piece": (), "holds": True, "again": agreement, "adjusted": 0.7} | more
         mark = self.more.get("mark", 1.0)
         self.found = bent(optimiser.store, found, mark) if isinstance(found, float) else found
@@ -193,6 +194,7 @@ class Settled:
         self.passes.append(backend.config.backend.passes)
         self.learned.append(backend.config.schedule["global"].learn)
         self.priors.append(backend.motion_prior)
+        self.points.append(backend.optimiser.points)
         disps = backend.optimiser.store.disps
         self.begun.append(float(disps.log().mean()))
         if self.more.get("halves"):
@@ -416,9 +418,27 @@ def test_pieces_set_out_before_each_of_the_first_turns(optimiser, config, monkey
 def test_what_has_set_out_anew_is_not_led_beyond(optimiser, config, monkeypatch, restarts, begun):
     config.backend.turns, config.backend.restarts, config.backend.beyond = 3, restarts, 3.0
     asked = iter([False, False, True])
-    monkeypatch.setattr(module._SecondLook, "_restart", lambda self: next(asked))
+    monkeypatch.setattr(module, "matched_points", lambda optimiser: "points")
+    monkeypatch.setattr(module._SecondLook, "_restart", lambda self, matches: next(asked))
     made = Settled(optimiser, config, monkeypatch, 0.6, mark=math.e, halves=True)
     assert made.begun == pytest.approx([1.0, 0.5, begun], rel=1e-5)
+
+
+@pytest.mark.parametrize(("found", "weight"), [("points", 7.0), ("points", 0.0), (None, 7.0)])
+def test_points_count_while_it_finishes(optimiser, config, monkeypatch, found, weight):
+    config.backend.points, config.backend.restarts = weight, 0
+    monkeypatch.setattr(module, "matched_points", lambda optimiser: found)
+    made = Settled(optimiser, config, monkeypatch, 0.6)
+    heard = (found, weight) if found and weight else None
+    assert made.points == [heard] * config.backend.turns
+    assert optimiser.points is None
+
+
+def test_points_are_forgotten_where_it_breaks_off(optimiser, config, monkeypatch):
+    monkeypatch.setattr(module, "matched_points", lambda optimiser: "points")
+    made = Settled(optimiser, config, monkeypatch, 0.6, adjusted=RuntimeError("no memory"))
+    assert made.events.warnings
+    assert optimiser.points is None
 
 
 def test_restarts_are_left_out_where_they_are_not_asked_for(optimiser, config, monkeypatch):

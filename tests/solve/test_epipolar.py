@@ -10,8 +10,10 @@ import torch
 from droidw.geometry import se3
 from droidw.solve.epipolar import (
     PointMatches,
+    cost_of,
     disagreement,
     epipolar_distance,
+    epipolar_term,
     led,
     planar_twin,
     steady_fit,
@@ -132,6 +134,80 @@ def test_normal_equations_are_those_of_autograd():
     assert torch.allclose(
         2 * gradient.reshape(-1, 6), slope, rtol=2e-2, atol=2e-2 * slope.abs().max()
     )
+
+
+@pytest.fixture
+def shaken():
+    """Poses along a wall that are a little off, and the matches of that wall."""
+    T, found, _ = wall()
+    g = torch.Generator().manual_seed(3)
+    off = 0.01 * torch.randn(len(T), 6, generator=g, dtype=torch.float64)
+    return se3.mul(se3.exp(off), T), found
+
+
+def test_a_term_of_poses_has_the_gradient_of_what_matches_cost(shaken):
+    T, found = shaken
+    term = epipolar_term(T, found, 3.0)
+
+    def energy(xi):
+        return 3.0 * disagreement(se3.mul(se3.exp(xi), T), found).sum()
+
+    zero = torch.zeros(len(T), 6, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(energy(zero), zero)
+    assert torch.allclose(-2 * term.rhs, slope, rtol=1e-8, atol=1e-8 * float(slope.abs().max()))
+
+
+def test_a_term_of_poses_bends_as_weighed_distances_do(shaken):
+    """The band against J^T W J of all distances, J by autograd."""
+    T, found = shaken
+    term = epipolar_term(T, found, 3.0)
+
+    def distances(xi):
+        moved = se3.mul(se3.exp(xi), T)
+        T_ji = se3.mul(moved[found.jj], se3.inv(moved[found.ii]))
+        return epipolar_distance(T_ji, found.here, found.there, FOCAL) / 0.2
+
+    zero = torch.zeros(len(T), 6, dtype=torch.float64)
+    J = torch.autograd.functional.jacobian(distances, zero).reshape(len(found), -1)
+    kept = 3.0 / (1.0 + distances(zero).square())
+    H = (J.T @ (kept[:, None] * J)).reshape(len(T), 6, len(T), 6).permute(0, 2, 1, 3)
+    assert term.band.shape[1] == 3
+    for m in range(len(T)):
+        k = torch.arange(m, len(T))
+        blocks = term.band[m:, m] if m < 3 else torch.zeros_like(H[k, k - m])
+        assert torch.allclose(blocks, H[k, k - m], rtol=1e-8, atol=1e-8 * float(H.abs().max()))
+
+
+def test_steps_by_points_alone_bring_a_path_to_them(shaken):
+    T, found = shaken
+    before = float(disagreement(T, found).sum())
+    for _ in range(10):
+        term = epipolar_term(T, found, 1.0)
+        H = torch.zeros(len(T), len(T), 6, 6, dtype=torch.float64)
+        for m in range(3):
+            k = torch.arange(m, len(T))
+            H[k, k - m], H[k - m, k] = term.band[m:, m], term.band[m:, m].mT
+        H = H.permute(0, 2, 1, 3).reshape(6 * len(T), -1)
+        x = torch.linalg.solve(H + 1e-3 * torch.eye(len(H)), term.rhs.reshape(-1))
+        T = se3.mul(se3.exp(x.reshape(-1, 6)), T)
+    assert float(disagreement(T, found).sum()) < 1e-3 * before
+
+
+def test_terms_of_poses_add_up_whatever_their_widths(shaken):
+    T, found = shaken
+    near = found.within(0, len(T) - 1, 1)
+    one, other = epipolar_term(T, near, 1.0), epipolar_term(T, found, 2.0)
+    assert one.band.shape[1] < other.band.shape[1]
+    g = torch.Generator().manual_seed(4)
+    x = torch.randn(len(T), 6, generator=g, dtype=torch.float64)
+    for both in (one + other, other + one):
+        assert float(both.energy(x)) == pytest.approx(float(one.energy(x) + other.energy(x)))
+
+
+def test_what_a_match_costs_is_told_in_fifths_of_a_pixel():
+    assert cost_of(0.0) == 0.0
+    assert cost_of(0.2) == pytest.approx(np.log(2))
+    assert cost_of(1.0) == pytest.approx(np.log(26))
 
 
 def test_matches_count_in_equal_parts_for_all_that_they_span():
