@@ -11,12 +11,14 @@ import torch
 from droidw.config.schema import CameraConfig, DroidwConfig
 from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
-from droidw.geometry.se3 import exp, mul
+from droidw.geometry.se3 import act, exp, inv, log, mul
+from droidw.graph.factors import FactorGraph
 from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.slam import backend as module
 from droidw.slam.backend import Backend
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.timing import Stopwatch
+from droidw.solve.epipolar import PointMatches
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 
 H, W, COUNT, BROKEN = 8, 12, 9, 3
@@ -132,6 +134,57 @@ def test_steady_motion_joins_what_no_match_joins(broken):
         left.append(residual() / before)
     assert left[0] > 0.8
     assert left[1] < 0.1
+
+
+def points_of(T_cw):
+    """Points of the world as all keyframes up to two apart see them, exactly."""
+    g = torch.Generator().manual_seed(2)
+    away = torch.rand(30, 3, generator=g, dtype=torch.float64) * 2 - 1 + torch.tensor([0.0, 0, 3])
+    T = T_cw.double()
+    X = act(inv(T[COUNT // 2]), away)
+    near = [(i, j) for i in range(COUNT) for j in range(i + 1, min(i + 3, COUNT))]
+    ends = torch.tensor(near).repeat_interleave(len(X), dim=0)
+    rays = [act(T[k], X.repeat(len(near), 1)) for k in ends.T]
+    here, there = (ray / ray[:, 2:] for ray in rays)
+    return PointMatches(ends[:, 0], ends[:, 1], here, there, 82.0)
+
+
+@pytest.mark.parametrize("prior", [0.0, 1e-3])
+def test_points_turn_what_no_match_joins(broken, arc, prior):
+    T_cw = arc(COUNT)
+    k = BROKEN - 1
+
+    def turned_off(store):
+        motion, right = (mul(T[k + 1], inv(T[k])) for T in (store.T_cw, T_cw))
+        return float(log(mul(motion, inv(right)))[3:].norm())
+
+    left = []
+    for points in (None, (points_of(T_cw), 5.0)):
+        backend, _ = broken(passes=[6, 6], joined=False)
+        backend.motion_prior, backend.optimiser.points = prior, points
+        before = turned_off(backend.optimiser.store)
+        run(backend)
+        left.append(turned_off(backend.optimiser.store) / before)
+    assert left[0] > 0.8
+    assert left[1] < 0.1
+
+
+@pytest.mark.parametrize(("first", "width"), [(0, 3), (2, None)])
+def test_points_count_in_steps_that_all_keyframes_have_a_part_in(broken, arc, first, width):
+    backend, _ = broken()
+    optimiser, made, terms = backend.optimiser, TorchBundleAdjuster(), []
+    optimiser.points = points_of(arc(COUNT)), 5.0
+    optimiser.parts = replace(
+        optimiser.parts,
+        ba=SimpleNamespace(step=lambda p: (terms.append(p.pose_term), made.step(p))[1]),
+    )
+    graph = FactorGraph(H, W, optimiser.store.device)
+    graph.add([(k + a, k + b) for k in range(first, COUNT - 1) for a, b in ((0, 1), (1, 0))])
+    phase = replace(backend.config.schedule["global"], learn=False)
+    session = optimiser.parts.correspondence.session("global")
+    optimiser.update(graph, session, phase, backend.config.global_solver, first_free=first + 1)
+    assert terms
+    assert {None if t is None else t.band.shape[1] for t in terms} == {width}
 
 
 @pytest.mark.parametrize(
