@@ -3,10 +3,10 @@
 Two clips with the same scene and camera tell what is luck in a figure: mirrored, a clip is as hard
 and rounded otherwise. In reverse it is another task, as it begins where the first one ends.
 
-    python benchmarks/variants.py DATA OUT
+    python benchmarks/variants.py DATA OUT [--size 320x240]
     droidw run OUT/NAME --preset cpu threads=1
 
-It writes the clips of CLIPS, 320 pixels wide, each also with `_mirrored`, `_reversed` and
+It writes the clips of CLIPS, each also with `_mirrored`, `_reversed` and
 `_reversed_mirrored` behind its name, and says how much of each moves.
 """
 
@@ -38,7 +38,7 @@ CLIPS = (  # name, what is seen, what is pasted over it
     ("kitchen_camel", "redkitchen_300", "composite_hospital"),
     ("kitchen_runner", "redkitchen_300", "davis_parkour+davis_car-roundabout"),
 )
-WIDTH, HEIGHT = 320, 240
+Size = tuple[int, int]  # width, height
 
 
 @dataclass(frozen=True)
@@ -57,15 +57,22 @@ class Clip:
     poses: npt.NDArray[np.float64]
     pinhole: tuple[float, float, float, float]
 
+    @property
+    def size(self) -> Size:
+        """Width and height of its pictures."""
+        height, width = self.pictures[0].shape[:2]
+        return width, height
+
     def mirrored(self) -> Clip:
         """Left and right changed in all pictures, and so in the world."""
+        width, _ = self.size
         fx, fy, cx, cy = self.pinhole
         return replace(
             self,
             pictures=[picture[:, ::-1] for picture in self.pictures],
             masks=[mask[:, ::-1] for mask in self.masks],
             poses=self.poses * (-1, 1, 1, 1, -1, -1, 1),
-            pinhole=(fx, fy, WIDTH - 1 - cx, cy),
+            pinhole=(fx, fy, width - 1 - cx, cy),
         )
 
     def reversed(self) -> Clip:
@@ -101,12 +108,13 @@ class Clip:
         (folder / "rgb.txt").write_text("".join(f"{t:.6f} rgb/{name}\n" for t, name in rows))
         write_tum(folder / "groundtruth.txt", Trajectory(self.times, self.poses))
         camera = zip(("fx", "fy", "cx", "cy"), self.pinhole, strict=True)
-        lines = [f"width {WIDTH}", f"height {HEIGHT}", *(f"{key} {v:.6f}" for key, v in camera)]
+        width, height = self.size
+        lines = [f"width {width}", f"height {height}", *(f"{key} {v:.6f}" for key, v in camera)]
         (folder / "camera.txt").write_text("\n".join(lines) + "\n")
 
 
-def read_clip(folder: Path) -> Clip:
-    """A clip with true poses, as large as all that is written here."""
+def read_clip(folder: Path, size: Size) -> Clip:
+    """A clip with true poses, brought to a size."""
     pictures, masks = (
         list_images(folder / n) if (folder / n).is_dir() else [] for n in ("rgb", "mask")
     )
@@ -115,19 +123,26 @@ def read_clip(folder: Path) -> Clip:
     times = np.loadtxt(folder / "rgb.txt", usecols=0, ndmin=1)
     if not set(times.tolist()) <= set(truth) or len(times) != len(pictures):
         raise SystemExit(f"{folder}: every picture needs a row of rgb.txt and a true pose")
-    camera, _ = read_calibration(folder / "camera.txt", WIDTH, HEIGHT)
+    camera, _ = read_calibration(folder / "camera.txt", *size)
     return Clip(
-        [_small(read_image(path)) for path in pictures],
-        [_small(read_mask(path).astype(np.uint8) * 255) > 127 for path in masks],
+        [_small(read_image(path), size) for path in pictures],
+        [_small(read_mask(path).astype(np.uint8) * 255, size) > 127 for path in masks],
         times,
         np.array([truth[time] for time in times.tolist()]),
         (camera.fx, camera.fy, camera.cx, camera.cy),
     )
 
 
-def _small(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
-    small = middle(image.astype(np.float32), WIDTH, HEIGHT)
+def _small(image: npt.NDArray[np.uint8], size: Size) -> npt.NDArray[np.uint8]:
+    small = middle(image.astype(np.float32), *size)
     return np.clip(np.rint(small), 0, 255).astype(np.uint8)
+
+
+def _size(text: str) -> Size:
+    width, cross, height = text.partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"{text!r} is no size; write WIDTHxHEIGHT, as 640x480")
+    return int(width), int(height)
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -135,15 +150,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder of the clips that these are made of")
     parser.add_argument("out", type=Path, help="folder to write, not there yet")
+    parser.add_argument(
+        "--size", type=_size, default=(320, 240), help="WIDTHxHEIGHT of all of them (320x240)"
+    )
     asked = parser.parse_args(argv)
     if asked.out.exists():
         raise SystemExit(f"{asked.out} is there already; name another folder")
     for name, scene, movers in CLIPS:
-        clip = read_clip(asked.data / scene)
+        clip = read_clip(asked.data / scene, asked.size)
         if movers:
             count = len(clip.pictures)
             folders = [asked.data / mover for mover in movers.split("+")]
-            clip = clip.under([read_layer(f, WIDTH, HEIGHT, count) for f in folders])
+            clip = clip.under([read_layer(f, *asked.size, count) for f in folders])
         share = np.mean(clip.masks) if clip.masks else 0.0
         back = clip.reversed()
         clip.write(asked.out / name)

@@ -111,7 +111,9 @@ class Correspondence(Protocol):
     It may besides have `matched_points(a, b, gate_a, gate_b) -> [n,4]`: points x, y of the picture
     of payload `a` and where they lie in that of `b`, pixels of the working size, found without any
     prediction and outside what the gates [h,w] (arrays in [0,1]) close. Where a path is in doubt,
-    they tell pieces of it that have settled in the wrong place (`backend.restarts`).
+    they tell pieces of it that have settled in the wrong place (`backend.restarts`) and count in
+    what follows (`backend.points`), for which most of them must be right to a fifth of a pixel:
+    leave out what lies on a line.
 
     Attributes:
         stride, offset: the grid: cell (x, y) lies at pixel `stride * (x, y) + offset`.

@@ -223,9 +223,10 @@ class _SecondLook:
             # What moves is known better with every turn, and so are the points on it.
             self.kept.write_to(self.optimiser.store)
             matches = matched_points(self.optimiser)
-            if matches is not None and options.points > 0:
-                self.optimiser.points = matches, options.points
-            restarted = matches is not None and turn < options.restarts and self._restart(matches)
+            self.optimiser.points, restarted = None, False
+            if matches is not None:
+                self.optimiser.points = (matches, options.points) if options.points > 0 else None
+                restarted = turn < options.restarts and self._restart(matches)
             start = self.kept
             if turn % 3 == 2 and options.beyond > 0 and not restarted:
                 start = self.kept.beyond(last, options.beyond)

@@ -25,7 +25,7 @@ def clip(variants):
     quaternions = rng.normal(size=(3, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     poses = np.concatenate([rng.normal(size=(3, 3)), quaternions], axis=1)
-    size = (variants.HEIGHT, variants.WIDTH)
+    size = (240, 320)
     pictures = [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for _ in range(3)]
     masks = [rng.random(size) > 0.7 for _ in range(3)]
     pinhole = (160.0, 150.0, 163.0, 119.5)
@@ -60,7 +60,7 @@ def test_in_reverse_what_belongs_together_stays_together(clip):
 
 def test_what_is_written_can_be_read_again(clip, tmp_path, variants):
     clip.write(tmp_path / "clip")
-    again = variants.read_clip(tmp_path / "clip")
+    again = variants.read_clip(tmp_path / "clip", (320, 240))
     assert np.allclose(again.poses, clip.poses, atol=1e-6) and np.allclose(again.times, clip.times)
     assert np.allclose(again.pinhole, clip.pinhole)
     assert all(np.array_equal(a, b) for a, b in zip(again.pictures, clip.pictures, strict=True))
@@ -72,7 +72,7 @@ def test_a_picture_without_a_pose_is_refused(clip, tmp_path, variants):
     truth = tmp_path / "clip" / "groundtruth.txt"
     truth.write_text("\n".join(truth.read_text().splitlines()[:2]) + "\n")
     with pytest.raises(SystemExit, match="true pose"):
-        variants.read_clip(tmp_path / "clip")
+        variants.read_clip(tmp_path / "clip", (320, 240))
 
 
 def test_all_of_them_are_written(clip, tmp_path, variants, monkeypatch, capsys):
@@ -94,3 +94,21 @@ def test_all_of_them_are_written(clip, tmp_path, variants, monkeypatch, capsys):
     picture = cv2.imread(str(tmp_path / "out/walk_dog_mirrored/rgb/000000.png"))
     assert (picture[:, ::-1][moves] == 9).all() and not (picture[:, ::-1][~moves] == 9).all()
     assert "walk_dog: 3 pictures" in capsys.readouterr().out
+
+
+def test_another_size_sees_the_same(clip, tmp_path, variants, monkeypatch):
+    clip.write(tmp_path / "data" / "walk")
+    monkeypatch.setattr(variants, "CLIPS", (("walk", "walk", ""),))
+    out = tmp_path / "out"
+    variants.main([str(tmp_path / "data"), str(out), "--size", "160x120"])
+    half = variants.read_clip(out / "walk_mirrored", (160, 120))
+    assert half.size == (160, 120)
+    assert half.pinhole == pytest.approx((80.0, 75.0, 159 - 81.25, 59.5))
+    assert "width 160\nheight 120\n" in (out / "walk" / "camera.txt").read_text()
+
+
+@pytest.mark.parametrize("size", ["160", "160x", "0x120", "ax9"])
+def test_what_is_no_size_is_refused(tmp_path, variants, capsys, size):
+    with pytest.raises(SystemExit):
+        variants.main([str(tmp_path), str(tmp_path / "out"), "--size", size])
+    assert "write WIDTHxHEIGHT" in capsys.readouterr().err

@@ -434,6 +434,15 @@ def test_points_count_while_it_finishes(optimiser, config, monkeypatch, found, w
     assert optimiser.points is None
 
 
+def test_points_of_a_turn_are_those_that_are_matched_then(optimiser, config, monkeypatch):
+    config.backend.restarts, config.backend.turns = 0, 3
+    matched = iter(["some", None, "others"])
+    monkeypatch.setattr(module, "matched_points", lambda optimiser: next(matched))
+    made = Settled(optimiser, config, monkeypatch, 0.6)
+    weight = config.backend.points
+    assert made.points == [("some", weight), None, ("others", weight)]
+
+
 def test_points_are_forgotten_where_it_breaks_off(optimiser, config, monkeypatch):
     monkeypatch.setattr(module, "matched_points", lambda optimiser: "points")
     made = Settled(optimiser, config, monkeypatch, 0.6, adjusted=RuntimeError("no memory"))
