@@ -18,6 +18,7 @@ import torch
 from droidw.geometry.projective import viewing_rays
 from droidw.geometry.se3 import chained, inv, mul
 from droidw.graph.factors import FactorGraph
+from droidw.graph.proximity import neighbour_edges
 from droidw.slam.backend import Backend
 from droidw.slam.path import Path
 from droidw.slam.splice import lead
@@ -70,9 +71,9 @@ def matched_points(optimiser: Optimiser) -> PointMatches | None:
         return None
     gates = optimiser.gates().cpu().numpy()
     found, ends = [], []
-    count = len(store)
-    near = [(i, j) for i in range(count) for j in range(i + 1, min(i + _GAP + 1, count))]
-    for i, j in near:
+    for i, j in neighbour_edges(len(store), _GAP):
+        if i > j:
+            continue
         points = find(store.payload(i), store.payload(j), gates[i], gates[j])
         found.append(np.asarray(points, np.float64).reshape(-1, 4))
         ends.append(np.tile((i, j), (len(points), 1)))

@@ -114,9 +114,7 @@ def epipolar_term(T_cw: Tensor, matches: PointMatches, weight: float) -> PoseTer
     """
     T = T_cw.double().to(matches.here.device)
     ii, jj = matches.ii, matches.jj
-    T_ji = mul(T[jj], inv(T[ii]))
-    r, J_j = _measured(T_ji, matches.here, matches.there, matches.focal)
-    r, J_j = r / _FAR, J_j / _FAR
+    T_ji, r, J_j = _judged(T, matches)
     kept = weight / (1.0 + r.square())
     # exp(w) on the right of T_ji is exp(Ad w) on its left
     J_i = -torch.einsum("ma,mab->mb", J_j, adjoint(T_ji))
@@ -218,9 +216,7 @@ def _changes(motions: Tensor) -> Tensor:
 def _normal_equations(motions: Tensor, matches: PointMatches) -> tuple[Tensor, Tensor]:
     """Of tangent vectors of all motions, [6(N-1),6(N-1)] and [6(N-1)], Gauss-Newton."""
     count, poses = len(motions), led(motions)
-    T_ji = mul(poses[matches.jj], inv(poses[matches.ii]))
-    r, J = _measured(T_ji, matches.here, matches.there, matches.focal)
-    r, J = r / _FAR, J / _FAR
+    _, r, J = _judged(poses, matches)
     kept = 1.0 / (1.0 + r.square())
     # All matches between two keyframes see the motions in between alike.
     pairs, at = torch.unique(matches.ii * (count + 1) + matches.jj, return_inverse=True)
@@ -246,6 +242,13 @@ def _normal_equations(motions: Tensor, matches: PointMatches) -> tuple[Tensor, T
     steady[at, :, at + 1] = moved[1:]
     steady = steady.reshape(6 * (count - 1), 6 * count)
     return H + steady.T @ steady, g + steady.T @ e.reshape(-1)
+
+
+def _judged(T: Tensor, matches: PointMatches) -> tuple[Tensor, Tensor, Tensor]:
+    """Motions [M,7] between the poses T [N,7] of matches, and distances and Jacobians in _FAR."""
+    T_ji = mul(T[matches.jj], inv(T[matches.ii]))
+    r, J = _measured(T_ji, matches.here, matches.there, matches.focal)
+    return T_ji, r / _FAR, J / _FAR
 
 
 def _measured(T_ji: Tensor, a: Tensor, b: Tensor, focal: float) -> tuple[Tensor, Tensor]:

@@ -14,7 +14,16 @@ if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow_types import FlowFrame
     from droidw_plugins.correspondence.flow import FlowOptions
 
-__all__ = ["information", "likeness", "sample", "structure", "trust", "turned"]
+__all__ = [
+    "information",
+    "likeness",
+    "powers",
+    "sample",
+    "slopes",
+    "structure",
+    "trust",
+    "turned",
+]
 
 # Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
 _FLAT = 0.1
@@ -64,8 +73,7 @@ def structure(
         `texture`, `power` and `normal` of `FlowFrame`, [h,w,2] each.
     """
     window = (2 * stride - 1, 2 * stride - 1)
-    dx = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32)
-    dy = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32)
+    dx, dy = slopes(grey)
     for slope in (dx, dy):
         slope[:_BORDER] = slope[-_BORDER:] = 0.0
         slope[:, :_BORDER] = slope[:, -_BORDER:] = 0.0
@@ -80,13 +88,24 @@ def structure(
     alone_x = xx - xy * xy / (yy + _FLAT)
     alone_y = yy - xy * xy / (xx + _FLAT)
     texture = np.sqrt(np.maximum(np.stack([alone_x, alone_y], -1), 0.0))
-    half, mean = (xx - yy) / 2, (xx + yy) / 2
-    off = np.hypot(half, xy)
-    # running sums over a flat window may end below 0
-    power = np.maximum(np.stack([mean + off, mean - off], -1), 0.0)
-    angle = 0.5 * np.arctan2(xy, half)
+    angle = 0.5 * np.arctan2(xy, (xx - yy) / 2)
     normal = np.stack([np.cos(angle), np.sin(angle)], -1).astype(np.float32)
-    return texture, power, normal
+    return texture, powers(xx, yy, xy), normal
+
+
+def slopes(grey: Array | npt.NDArray[np.uint8]) -> tuple[Array, Array]:
+    """Derivatives of a picture [H,W] by x and by y, grey levels per pixel, [H,W] each."""
+    dx: Any = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32)
+    dy: Any = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32)
+    return dx, dy
+
+
+def powers(xx: Array, yy: Array, xy: Array) -> Array:
+    """Of structure tensors [...], the power across the strongest edge and along it, [...,2]."""
+    mean, off = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    # running sums over a flat window may end below 0
+    power: Array = np.maximum(np.stack([mean + off, mean - off], -1), 0.0)
+    return power
 
 
 def trust(apart: Array, normal: Array, options: FlowOptions) -> tuple[Array, Array]:

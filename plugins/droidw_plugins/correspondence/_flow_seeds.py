@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from droidw_plugins.correspondence._flow_information import powers, slopes
 from droidw_plugins.correspondence._flow_types import Array, Kept
 
 if TYPE_CHECKING:
@@ -140,12 +141,12 @@ def detect(grey: Picture, most: int) -> Points:
 
 def _held(grey: Picture, at: Array) -> Mask:
     """Which points [n,2] of a picture are held in both directions, [n]."""
-    dx, dy = (cv2.Scharr(grey, cv2.CV_32F, *along, scale=1 / 32) for along in ((1, 0), (0, 1)))
-    xx, yy, xy = (cv2.GaussianBlur(p, (0, 0), _HOLDS) for p in (dx * dx, dy * dy, dx * dy))
-    mean, off = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    dx, dy = slopes(grey)
+    tensor = (cv2.GaussianBlur(p, (0, 0), _HOLDS) for p in (dx * dx, dy * dy, dx * dy))
     height, width = grey.shape
     x, y = np.rint(at).astype(np.int64).clip(0, (width - 1, height - 1)).T
-    held: Mask = (mean - off > _HELD * (mean + off))[y, x]
+    across, along = powers(*(part[y, x] for part in tensor)).T
+    held: Mask = along > _HELD * across
     return held
 
 
