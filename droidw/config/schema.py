@@ -208,6 +208,13 @@ class BackendConfig:
         True,
         "of the way that agrees less there and back, take the pieces in which more agrees",
     )
+    restart_below: float = opt(
+        0.8,
+        "agreement below which pieces that points contradict set out anew even where there is no "
+        "doubt; whether there is, is asked of what comes of it (0: never, 1: however much agrees)",
+        ge=0,
+        le=1,
+    )
     restarts: int = opt(
         1,
         "times that pieces of what was kept of the way back set out anew from a steady motion, "

@@ -48,9 +48,11 @@ def doubted(
     events: Dispatcher,
     stopped: Callable[[], bool],
 ) -> Diagnosis:
-    """Where too little of what a run measured agrees, let it have what the way back finds better.
+    """Where too little of what a run measured agrees, let it have what a second look finds better.
 
-    The way there is adjusted once more first, by the measurements that doubt asks for. The way back
+    Where not quite too little agrees, pieces that points contradict set out anew first: a path in
+    the wrong valley agrees with itself, so it is the one they leave that is to be judged. Then the
+    way there is adjusted once more first, by the measurements that doubt asks for. The way back
     is kept if more of what it measures agrees, then pieces of the way that agrees less in which it
     agrees more; with what is kept uncertainty goes on learning. What fails is left out.
 
@@ -61,24 +63,28 @@ def doubted(
     Returns:
         What to say of what is kept.
     """
-    agreement = found.agreement
-    if not doubtful(agreement, config.backend.backwards_below):
+    options = config.backend
+    in_doubt = doubtful(found.agreement, options.backwards_below)
+    if not in_doubt and not doubtful(found.agreement, options.restart_below):
         return found
-    _log.info(
-        "%.0f %% of what was measured agrees with poses and depths: tracking the keyframes "
-        "backwards (backend.backwards_below=0 does not)",
-        100 * agreement,
-    )
-    look = _SecondLook(optimiser, config, agreement, events, stopped)
+    look = _SecondLook(optimiser, config, found.agreement, events, stopped)
     optimiser.doubtful = True
     try:
         with optimiser.clock("backwards"):
-            look.run()
+            if not in_doubt:
+                look.set_out_anew()
+            if in_doubt or doubtful(look.kept.agreement, options.backwards_below):
+                _log.info(
+                    "%.0f %% of what was measured agrees with poses and depths: tracking the "
+                    "keyframes backwards (backend.backwards_below=0 does not)",
+                    100 * look.kept.agreement,
+                )
+                look.run()
     except _Stopped:
         pass
     except Exception as error:  # noqa: BLE001 - what was found forwards is as good as it was
         why = str(error) or type(error).__name__
-        events.warn(f"tracking the keyframes backwards broke off, the best so far is kept: {why}")
+        events.warn(f"a second look at the keyframes broke off, the best so far is kept: {why}")
     finally:
         optimiser.doubtful, optimiser.points = False, None
     look.kept.write_to(optimiser.store)
@@ -86,7 +92,7 @@ def doubted(
 
 
 class _SecondLook:
-    """What is made of the way back.
+    """What is made of points and of the way back.
 
     Attributes:
         kept: the best path so far.
@@ -116,8 +122,19 @@ class _SecondLook:
         steps += few * sum(options.passes[-_FEW_PASSES:])
         self._total = len(optimiser.store) + steps
 
+    def set_out_anew(self) -> None:
+        """Pieces that points contradict, once, with `kept` up to date whenever it is left."""
+        matches = matched_points(self.optimiser)
+        if matches is None:
+            return
+        whole, self._total = self._total, 2 * sum(self.config.backend.passes[-_FEW_PASSES:])
+        self._give_say(matches)
+        self._restart(matches)
+        self.optimiser.points = None
+        self._total, self._done = whole, 0
+
     def run(self) -> None:
-        """All of it, with `kept` up to date whenever it is left."""
+        """All of the way back, with `kept` up to date whenever it is left."""
         options = self.config.backend
         # Measured as the way back will be, or neither could be held against the other.
         there = self._adjusted(self.kept, options.passes[-_FEW_PASSES:], learn=False)
@@ -205,6 +222,11 @@ class _SecondLook:
             self.kept = found
         return leads
 
+    def _give_say(self, matches: PointMatches | None) -> None:
+        """Let points count in the adjustments to come."""
+        weight = self.config.backend.points
+        self.optimiser.points = (matches, weight) if matches is not None and weight > 0 else None
+
     def _finish(self) -> None:
         """Adjust the path that is kept while uncertainty learns from it and steady motion counts.
 
@@ -223,10 +245,8 @@ class _SecondLook:
             # What moves is known better with every turn, and so are the points on it.
             self.kept.write_to(self.optimiser.store)
             matches = matched_points(self.optimiser)
-            self.optimiser.points, restarted = None, False
-            if matches is not None:
-                self.optimiser.points = (matches, options.points) if options.points > 0 else None
-                restarted = turn < options.restarts and self._restart(matches)
+            self._give_say(matches)
+            restarted = matches is not None and turn < options.restarts and self._restart(matches)
             start = self.kept
             if turn % 3 == 2 and options.beyond > 0 and not restarted:
                 start = self.kept.beyond(last, options.beyond)

@@ -456,3 +456,56 @@ def test_restarts_are_left_out_where_they_are_not_asked_for(optimiser, config, m
     made = Settled(optimiser, config, monkeypatch, 0.6)
     assert points.set == 0
     assert made.learned == [True, True]
+
+
+# Of a path that points contradict, agreement is what the wrong path makes of it.
+@pytest.mark.parametrize(("left", "asked"), [(0.69, 1), (0.72, 0)])
+def test_what_sets_out_anew_is_what_is_doubted(optimiser, config, monkeypatch, left, asked):
+    config.backend.backwards_below, config.backend.turns = 0.7, 0
+    before = optimiser.store.T_cw.clone()
+    points = Points(monkeypatch, [1.0, 0.5])
+    made = Settled(optimiser, config, monkeypatch, None, 0.75, again=left)
+    assert (points.set, made.asked, points.gains) == (1, asked, [])
+    assert made.kept.agreement == left
+    assert made.kept.backwards == 0.0
+    assert not torch.allclose(optimiser.store.T_cw, before)
+    assert optimiser.points is None
+    assert not optimiser.doubtful
+
+
+def test_what_points_gain_nothing_by_is_left_as_it_was(optimiser, config, monkeypatch):
+    config.backend.backwards_below = 0.7
+    before = optimiser.store.T_cw.clone()
+    points = Points(monkeypatch, [0.1])
+    made = Settled(optimiser, config, monkeypatch, None, 0.75, again=0.5)
+    assert (points.set, made.asked, made.kept.agreement) == (1, 0, 0.75)
+    assert torch.equal(optimiser.store.T_cw, before)
+
+
+@pytest.mark.parametrize(
+    ("below", "agreement", "asked"),
+    [(0.8, 0.79, 1), (0.8, 0.8, 0), (0.0, 0.71, 0), (1.0, 1.0, 1), (0.8, float("nan"), 0)],
+)
+def test_points_are_asked_where_not_quite_enough_agrees(
+    optimiser, config, monkeypatch, below, agreement, asked
+):
+    config.backend.backwards_below, config.backend.restart_below = 0.7, below
+    points = Points(monkeypatch, [0.1])
+    made = Settled(optimiser, config, monkeypatch, None, agreement)
+    assert (points.set, made.asked) == (asked, 0)
+
+
+def test_points_count_while_pieces_set_out_first(optimiser, config, monkeypatch):
+    config.backend.backwards_below, config.backend.points = 0.7, 3.0
+    counted = []
+
+    def run(backend, tell):
+        counted.append(backend.optimiser.points)
+        backend.agreement = 0.75
+
+    Points(monkeypatch, [1.0, 0.5])
+    monkeypatch.setattr(module.Backend, "run", run)
+    monkeypatch.setattr(module, "support", lambda *_: torch.ones(COUNT - 1, dtype=torch.float64))
+    diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=0.75)
+    doubted(optimiser, config, diagnosis, Dispatcher(), lambda: False)
+    assert counted == [("points", 3.0)] * 2
