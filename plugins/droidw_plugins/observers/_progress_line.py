@@ -25,7 +25,7 @@ __all__ = ["ProgressLine", "memory_mib"]
 
 _LABELS = {
     "global": "global bundle adjustment",
-    "backwards": "keyframes backwards",
+    "backwards": "second look",
     "fill": "poses of all frames",
     "export": "export",
 }
