@@ -52,7 +52,7 @@ def doubted(
 
     Where not quite too little agrees, pieces that points contradict set out anew first: a path in
     the wrong valley agrees with itself, so it is the one they leave that is to be judged. Then the
-    way there is adjusted once more first, by the measurements that doubt asks for. The way back
+    way there is adjusted once more, by the measurements that doubt asks for. The way back
     is kept if more of what it measures agrees, then pieces of the way that agrees less in which it
     agrees more; with what is kept uncertainty goes on learning. What fails is left out.
 
@@ -73,7 +73,7 @@ def doubted(
         with optimiser.clock("backwards"):
             if not in_doubt:
                 look.set_out_anew()
-            if in_doubt or doubtful(look.kept.agreement, options.backwards_below):
+            if doubtful(look.kept.agreement, options.backwards_below):
                 _log.info(
                     "%.0f %% of what was measured agrees with poses and depths: tracking the "
                     "keyframes backwards (backend.backwards_below=0 does not)",
