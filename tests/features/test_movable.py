@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch.nn import functional as F
 
+from droidw.errors import ConfigError
 from droidw.geometry.camera import Grid
 from droidw.plugin.component import BuildContext
 from droidw_plugins.features._cnn import CnnFeatures, find_weights
@@ -46,3 +48,22 @@ def test_a_probability_for_each_cell_of_any_grid() -> None:
         assert torch.equal(p, extractor.movable(image, grid))
     tiny = extractor.movable(image[:, :24, :24], Grid(3, 3, 8, 3.5))
     assert bool(torch.isfinite(tiny).all())
+
+
+def test_the_largest_answer_of_several_sizes_counts() -> None:
+    image = torch.rand(3, 96, 128, generator=torch.Generator().manual_seed(2))
+    grid = Grid(12, 16, 8, 3.5)
+
+    def at(*scales: float) -> torch.Tensor:
+        options = CnnOptions(movable_scales=list(scales))
+        return CnnFeatures(options, BuildContext(CPU)).movable(image, grid)
+
+    one, two = at(1.0), at(2.0)
+    assert not torch.equal(one, two)
+    assert torch.equal(at(1.0, 2.0), torch.maximum(one, two))
+
+
+@pytest.mark.parametrize("scales", [[], [0.0], [1.0, 9.0]])
+def test_sizes_that_make_no_picture_are_refused(scales: list[float]) -> None:
+    with pytest.raises(ConfigError, match="movable_scales"):
+        CnnFeatures(CnnOptions(movable_scales=scales), BuildContext(CPU))

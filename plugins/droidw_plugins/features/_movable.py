@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MOVABLE", "MovableClassifier"]
 
-# Of the picture before the search: parts of things are classified too, and a cell of the last
-# layers is 32 pixels wide.
-_ENLARGED = 1.5
+# Pixels of a cell of the last layers.
 _STRIDE = 32
 
 _ANIMALS = range(398)
@@ -50,15 +48,18 @@ class MovableClassifier:
     Args:
         path: of its published weights.
         device: where to compute.
+        scales: times the size of the picture at which it looks; the largest answer counts. What
+            is small is only known enlarged, and of what is large only parts are seen then.
     Raises:
         MissingRequirementError: the weights are missing or do not fit.
     """
 
-    def __init__(self, path: Path, device: torch.device) -> None:
+    def __init__(self, path: Path, device: torch.device, scales: tuple[float, ...]) -> None:
         self._trunk, self._head, self._classes = load_classifier(path, len(BLOCKS) - 1, device)
         movable = torch.zeros(self._classes.weight.shape[0], device=device)
         movable[list(MOVABLE)] = 1.0
         self._movable = movable[:, None, None]
+        self._scales = scales
 
     @torch.no_grad()
     def __call__(self, image: Tensor, grid: Grid) -> Tensor:
@@ -68,8 +69,11 @@ class MovableClassifier:
             image: [3,H,W], normalised as the network wants it.
             grid: of the cells.
         """
+        return torch.stack([self._at(scale, image, grid) for scale in self._scales]).amax(0)
+
+    def _at(self, scale: float, image: Tensor, grid: Grid) -> Tensor:
         height, width = (
-            max(round(side * _ENLARGED / _STRIDE), 1) * _STRIDE for side in image.shape[1:]
+            max(round(side * scale / _STRIDE), 1) * _STRIDE for side in image.shape[1:]
         )
         large = F.interpolate(image[None], (height, width), mode="bilinear", align_corners=False)
         seen = F.relu6(self._head(self._trunk(large)[0]))

@@ -59,6 +59,13 @@ class CnnOptions:
             "ge": 0,
         },
     )
+    movable_scales: list[float] = field(
+        default_factory=lambda: [1.5],
+        metadata={
+            "help": "times the size of the picture at which it is classified to tell what can "
+            "move; the largest answer counts (1,2,3: small things are seen, too)",
+        },
+    )
     length: float = field(default=20.0, metadata={"help": "length of a feature vector", "gt": 0})
     weights: str | None = field(
         default=None, metadata={"help": "path of the weights file (none: that of the package)"}
