@@ -19,6 +19,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from movers import Layer, read_layer
 from variants import Clip, Size, read_clip
 
@@ -44,12 +45,13 @@ class Mover:
         layer = read_layer(data / self.clip, *size, frames + self.later)[self.later :]
         return [(self._placed(picture), self._placed(share)) for picture, share in layer]
 
-    def _placed(self, image: np.ndarray) -> np.ndarray:
+    def _placed(self, image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         height, width = image.shape[:2]
         image = np.ascontiguousarray(image[:, ::-1]) if self.mirrored else image
         left = width / 2 * (1 - self.scale) + self.across * width
         affine = np.array([[self.scale, 0, left], [0, self.scale, height * (1 - self.scale)]])
-        return cv2.warpAffine(image, affine, (width, height), flags=cv2.INTER_LINEAR)
+        placed = cv2.warpAffine(image, affine, (width, height), flags=cv2.INTER_LINEAR)
+        return np.asarray(placed, dtype=np.float32)
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for name, made in CLIPS.items():
         clip = make(asked.data, made)
         clip.write(asked.out / name)
-        share = np.mean(clip.masks) if clip.masks else 0.0
-        print(f"{name}: {len(clip.pictures)} pictures, {share:.0%} of them moves")
+        print(f"{name}: {len(clip.pictures)} pictures, {clip.moving:.0%} of them moves")
 
 
 if __name__ == "__main__":

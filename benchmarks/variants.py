@@ -63,6 +63,11 @@ class Clip:
         height, width = self.pictures[0].shape[:2]
         return width, height
 
+    @property
+    def moving(self) -> float:
+        """Share of its pixels that moves."""
+        return float(np.mean(self.masks)) if self.masks else 0.0
+
     def mirrored(self) -> Clip:
         """Left and right changed in all pictures, and so in the world."""
         width, _ = self.size
@@ -162,13 +167,12 @@ def main(argv: Sequence[str] | None = None) -> None:
             count = len(clip.pictures)
             folders = [asked.data / mover for mover in movers.split("+")]
             clip = clip.under([read_layer(f, *asked.size, count) for f in folders])
-        share = np.mean(clip.masks) if clip.masks else 0.0
         back = clip.reversed()
         clip.write(asked.out / name)
         clip.mirrored().write(asked.out / f"{name}_mirrored")
         back.write(asked.out / f"{name}_reversed")
         back.mirrored().write(asked.out / f"{name}_reversed_mirrored")
-        print(f"{name}: {len(clip.pictures)} pictures, {share:.0%} of them moves")
+        print(f"{name}: {len(clip.pictures)} pictures, {clip.moving:.0%} of them moves")
 
 
 if __name__ == "__main__":
