@@ -26,9 +26,10 @@ class FeatureExtractor(Protocol):
     (at measured matches three quarters are above 0.895 and half above 0.93, docs/features.md).
     Uncertainty models then take it as it is; without it they bring it there themselves.
 
-    And it may have a method `movable(image, grid)`, with the arguments of `extract`: the
-    probability [h,w] that a cell shows what can move by itself, such as a person, an animal or a
-    vehicle, whether it does or not. Uncertainty models may start from that; nobody needs it.
+    And it may have a method `movable(image, grid)`, with the arguments of `extract`: how much
+    speaks for it that a cell shows what can move by itself, [h,w] from 0 (nothing) to 1, such as a
+    person, an animal or a vehicle, whether it does or not. Uncertainty models may start from that;
+    nobody needs it.
     """
 
     dim: int

@@ -89,7 +89,7 @@ def _movable(subject: Subject, part: Any, image: Tensor, grid: Grid, what: str) 
     subject.expect(
         "range",
         bool(((found >= 0) & (found <= 1)).all()),
-        f"movable is no probability somewhere on {what}",
+        f"movable is not from 0 to 1 somewhere on {what}",
     )
     subject.expect(
         "deterministic",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 import torch
 from torch.nn import functional as F
@@ -11,7 +13,7 @@ from droidw.geometry.camera import Grid
 from droidw.plugin.component import BuildContext
 from droidw_plugins.features._cnn import CnnFeatures, find_weights
 from droidw_plugins.features._efficientnet import BLOCKS, load_classifier
-from droidw_plugins.features._movable import MOVABLE
+from droidw_plugins.features._movable import MOVABLE, MovableClassifier
 from droidw_plugins.features.cnn import CnnOptions
 
 CPU = torch.device("cpu")
@@ -38,7 +40,7 @@ def test_classes_are_each_named_once() -> None:
     assert {354, 817, 610} <= set(MOVABLE) and not {526, 799, 975} & set(MOVABLE)
 
 
-def test_a_probability_for_each_cell_of_any_grid() -> None:
+def test_a_number_from_0_to_1_for_each_cell_of_any_grid() -> None:
     extractor = CnnFeatures(CnnOptions(), BuildContext(CPU))
     image = torch.rand(3, 100, 136, generator=torch.Generator().manual_seed(1))
     for grid in (Grid(12, 17, 8, 3.5), Grid(25, 34, 4, 1.5)):
@@ -61,6 +63,28 @@ def test_the_largest_answer_of_several_sizes_counts() -> None:
     one, two = at(1.0), at(2.0)
     assert not torch.equal(one, two)
     assert torch.equal(at(1.0, 2.0), torch.maximum(one, two))
+
+
+def test_what_says_nothing_is_no_evidence() -> None:
+    blank, grid = torch.full((3, 96, 128), 0.6), Grid(12, 16, 8, 3.5)
+
+    def at(evidence: Literal["information", "probability"]) -> torch.Tensor:
+        return CnnFeatures(CnnOptions(movable_evidence=evidence), BuildContext(CPU)).movable(
+            blank, grid
+        )
+
+    assert float(at("information").max()) < 0.1
+    assert float(at("probability").max()) > 0.2
+
+
+def test_evidence_is_the_information_of_the_classes_that_move() -> None:
+    classifier = MovableClassifier(find_weights(), CPU, (1.0,), information=True)
+    p = torch.full((1, 1000, 1, 3), 1e-9)
+    p[0, :, 0, 0] = 1e-3  # anything
+    p[0, 354, 0, 1] = 1.0  # a camel
+    p[0, 526, 0, 2] = 1.0  # a desk
+    found = classifier._evidence((p / p.sum(1, keepdim=True)).log())
+    assert torch.allclose(found, torch.tensor([0.0, 1.0, 0.0]).view(1, 1, 1, 3), atol=1e-5)
 
 
 @pytest.mark.parametrize("scales", [[], [0.0], [1.0, 9.0]])

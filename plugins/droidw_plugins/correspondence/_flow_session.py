@@ -111,7 +111,6 @@ class FlowSession:
             pairs.setdefault((min(i, j), max(i, j)), {})[i < j] = row
 
         options = self._owner.options
-        seeded = options.seeds > 0 and (request.doubtful or options.seeds_always)
         valid = request.valid.cpu().numpy() if request.informed and wanted else None
 
         def start(row: int | None) -> Array | None:
@@ -123,6 +122,8 @@ class FlowSession:
             a, b = request.payload(key[0]), request.payload(key[1])
             starts = start(rows.get(True)), start(rows.get(False))
             without = bridged.get(key[0], a), bridged.get(key[1], b)
+            poor = request.doubtful or min(f.held for f in without) < options.seeds_below
+            seeded = options.seeds > 0 and poor
             return lambda: self._owner.both_ways(
                 a, b, *starts, self._fine, bridged=without, seeded=seeded
             )

@@ -21,6 +21,9 @@ Value = TypeVar("Value")
 # Median distance of two starts, in cells, that lead to the same result: a search goes on from the
 # coarsest level, where a pixel is little.
 _SAME_START = 0.15
+# Power of the picture along the strongest edge of a cell from which on a match cannot slip there,
+# (grey levels per pixel)^2, and as a share of that across it.
+_SOME_POWER, _HELD = 1.0, 0.1
 # Frames that may be missing before the motion so far is forgotten.
 _LONGEST_GAP = 3
 
@@ -63,6 +66,13 @@ class FlowFrame:
     def taken_out(self) -> bytes | None:
         """What tells bridges over the same frame apart."""
         return None if self.bridged is None else np.packbits(self.bridged).tobytes()
+
+    @property
+    def held(self) -> float:
+        """Share of the cells that are not bridged and have structure in two directions."""
+        across, along = self.power[..., 0], self.power[..., 1]
+        held = (along > _SOME_POWER) & (along > _HELD * across)
+        return float((held if self.bridged is None else held & ~self.bridged).mean())
 
     @property
     def sharp(self) -> npt.NDArray[np.uint8]:

@@ -142,14 +142,21 @@ class FlowOptions:
         default=1500,
         metadata={
             "help": "points of a keyframe that are matched by their descriptors (SIFT) where the "
-            "path is in doubt; another search sets out from those that are off what was found, "
-            "and its matches count where they are surer (0: none)",
+            "path is in doubt, or pictures say little (seeds_below); another search sets out from "
+            "those that are off what was found, and its matches count where they are surer "
+            "(0: none)",
             "ge": 0,
         },
     )
-    seeds_always: bool = field(
-        default=False,
-        metadata={"help": "the same where nothing is in doubt, too, for twice the time"},
+    seeds_below: float = field(
+        default=0.33,
+        metadata={
+            "help": "share of a picture's cells that stand still and have structure in two "
+            "directions, below which points are matched before there is doubt, too "
+            "(0: only in doubt; 1: always, for twice the time)",
+            "ge": 0.0,
+            "le": 1.0,
+        },
     )
     still: float = field(
         default=0.35, metadata={"help": "flow that counts as no motion, in pixels", "ge": 0.0}

@@ -131,10 +131,15 @@ class CnnFeatures:
         return calibration(torch.cat(taps)).to(self.dtype)
 
     def movable(self, image: Tensor, grid: Grid) -> Tensor:
-        """Probability [h,w] of animals, vehicles and clothes; see `MovableClassifier`."""
+        """Evidence [h,w] of animals, vehicles and clothes; see `MovableClassifier`."""
         if self._classifier is None:
-            scales = tuple(self._options.movable_scales)
-            self._classifier = MovableClassifier(self._path, self._mean.device, scales)
+            options = self._options
+            self._classifier = MovableClassifier(
+                self._path,
+                self._mean.device,
+                tuple(options.movable_scales),
+                options.movable_evidence == "information",
+            )
         return self._classifier((image - self._mean) / self._std, grid)
 
     def state_dict(self) -> dict[str, Any]:

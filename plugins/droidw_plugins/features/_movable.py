@@ -2,13 +2,18 @@
 
 EfficientNet-Lite0 was trained on the thousand classes of ILSVRC 2012. Its last layers are applied
 to every place instead of the mean of all (Oquab et al., "Is object localization for free?", CVPR
-2015), and the probabilities of animals, of vehicles and of what people wear are added up. This is
+2015), and what they say for animals, for vehicles and for what people wear is added up. This is
 coarse, wide of the contours, and only says what could move: enough to begin with, before any motion
 is known.
+
+Half of the classes are such. Before a bare wall all of them are about as likely, and their
+probabilities add up to a half, though nothing at all was seen. So what counts is the information:
+by how much the probabilities of these classes are above those of a picture that says nothing.
 """
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,22 +53,27 @@ class MovableClassifier:
     Args:
         path: of its published weights.
         device: where to compute.
+        information: whether the information p log(n p) of these classes, of n in all, counts, as a
+            share of the most there can be, log n; otherwise their probability p.
         scales: times the size of the picture at which it looks; the largest answer counts. What
             is small is only known enlarged, and of what is large only parts are seen then.
     Raises:
         MissingRequirementError: the weights are missing or do not fit.
     """
 
-    def __init__(self, path: Path, device: torch.device, scales: tuple[float, ...]) -> None:
+    def __init__(
+        self, path: Path, device: torch.device, scales: tuple[float, ...], information: bool
+    ) -> None:
         self._trunk, self._head, self._classes = load_classifier(path, len(BLOCKS) - 1, device)
         movable = torch.zeros(self._classes.weight.shape[0], device=device)
         movable[list(MOVABLE)] = 1.0
         self._movable = movable[:, None, None]
         self._scales = scales
+        self._information = information
 
     @torch.no_grad()
     def __call__(self, image: Tensor, grid: Grid) -> Tensor:
-        """Probability [h,w] that a cell shows what can move by itself.
+        """How much speaks for it that a cell shows what can move by itself, [h,w] in [0,1].
 
         Args:
             image: [3,H,W], normalised as the network wants it.
@@ -77,6 +87,15 @@ class MovableClassifier:
         )
         large = F.interpolate(image[None], (height, width), mode="bilinear", align_corners=False)
         seen = F.relu6(self._head(self._trunk(large)[0]))
-        share = (self._classes(seen).softmax(1) * self._movable).sum(1, keepdim=True)
+        share = self._evidence(self._classes(seen).log_softmax(1))
         cells = (grid.height, grid.width)
         return F.interpolate(share, cells, mode="bilinear", align_corners=False)[0, 0]
+
+    def _evidence(self, log_p: Tensor) -> Tensor:
+        """Evidence [B,1,...] for classes that move, from logarithms of probabilities [B,n,...]."""
+        p = log_p.exp()
+        if not self._information:
+            return (p * self._movable).sum(1, keepdim=True)
+        most = math.log(log_p.shape[1])
+        told: Tensor = (p * (log_p + most) * self._movable).sum(1, keepdim=True)
+        return (told / most).clamp(0.0, 1.0)

@@ -66,6 +66,13 @@ class CnnOptions:
             "move; the largest answer counts (1,2,3: small things are seen, too)",
         },
     )
+    movable_evidence: Literal["information", "probability"] = field(
+        default="information",
+        metadata={
+            "help": "what tells what can move: by how much the classes that move are more likely "
+            "than where nothing is seen, or how likely they are (0.5 before a bare wall)"
+        },
+    )
     length: float = field(default=20.0, metadata={"help": "length of a feature vector", "gt": 0})
     weights: str | None = field(
         default=None, metadata={"help": "path of the weights file (none: that of the package)"}
