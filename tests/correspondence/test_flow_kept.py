@@ -90,3 +90,25 @@ def test_another_start_is_another_search(operator, pair, searches):
     made.clear()
     ask(part, frames, 8, start + np.float32(1.0))
     assert [whole for whole, _ in made] == [True, True, False, False]
+
+
+@pytest.mark.parametrize(("change", "again"), [(0.0, True), (0.02, False)])
+def test_a_few_cells_more_or_less_need_no_new_search(operator, pair, searches, change, again):
+    part = operator(bridge_change=change)
+    frames, made = pair(part), searches(part)
+
+    def found(gate):
+        without = tuple(bridge(f, gate, 0.5, 7, part.options.blur) for f in frames)
+        return part.both_ways(*frames, None, None, fine=True, bridged=without)
+
+    gate = np.ones(frames[0].normal.shape[:2], np.float32)
+    gate[:, :4] = 0.0
+    found(gate)
+    made.clear()
+    gate[:2, 4] = 0.0  # 2 of 300 cells more
+    found(gate)
+    assert bool(made) is again
+    made.clear()
+    gate[:, 4:6] = 0.0  # many more than when it was searched
+    found(gate)
+    assert made

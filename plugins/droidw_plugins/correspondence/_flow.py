@@ -42,6 +42,7 @@ from droidw_plugins.correspondence._flow_types import (
     Kept,
     Track,
     set_out_from,
+    taken_out_alike,
 )
 
 if TYPE_CHECKING:
@@ -87,6 +88,7 @@ class FlowCorrespondence:
         self._full: Kept[_Pair, Array] = Kept(_FULL_FIELDS)
         self._grid: Kept[_Pair, Array] = Kept(_GRID_FIELDS)
         self._seeds = SeedBook(options.seeds)
+        self._same = options.bridge_change
         self._pairs: Kept[tuple[Hashable, ...], tuple[Edge, Edge]] = Kept(_PAIRS)
         self._plain: Kept[tuple[Hashable, ...], tuple[Found, Found]] = Kept(_PAIRS)
 
@@ -239,23 +241,21 @@ class FlowCorrespondence:
     ) -> tuple[Edge, Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
-        What an earlier session found from about the same start is as good as a new search.
+        What was found without about the same cells, from about the same start, is kept.
 
         Args:
             a, b: frames. start_ab, start_ba: targets [h,w,2] to start from; None: free.
             fine: as for global adjustment.
-            bridged: the frames without what moves, or themselves; what a second search finds
-                between these is taken where it is surer.
+            bridged: both without what moves, or as they are; what is found there counts if surer.
             seeded: whether another search sets out from points matched by their descriptors.
         """
         c, d = bridged
-        again = c.bridged is not None or d.bridged is not None
-        key = (a.key, b.key, fine, seeded, c.taken_out, d.taken_out)
+        key = (a.key, b.key, fine, seeded)
         starts = start_ab, start_ba
         known = self._pairs.get(key)
-        if known is not None and set_out_from(known, starts):
+        if known and set_out_from(known, starts) and taken_out_alike(known, bridged, self._same):
             return replace(known[0]), replace(known[1])
-        whole = self._whole((a, b), starts, fine) if again else None
+        whole = None if c.bridged is d.bridged is None else self._whole((a, b), starts, fine)
         flows = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
         both = self._checked_both((c, d), self._found_both((c, d), flows, starts))
         if whole is not None:
@@ -265,6 +265,7 @@ class FlowCorrespondence:
         if seeded:
             seeds = self._seeds.between(a, b, c.bridged, d.bridged)
             both = self._seeded(seeds, (c, d), flows, both, fine)
+        both = replace(both[0], bridged=c.bridged), replace(both[1], bridged=d.bridged)
         self._pairs.put(key, both)
         return replace(both[0]), replace(both[1])
 

@@ -12,7 +12,16 @@ from typing import Generic, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Array", "Edge", "FlowFrame", "Found", "Kept", "Track", "set_out_from"]
+__all__ = [
+    "Array",
+    "Edge",
+    "FlowFrame",
+    "Found",
+    "Kept",
+    "Track",
+    "set_out_from",
+    "taken_out_alike",
+]
 
 Array = npt.NDArray[np.float32]
 Key = TypeVar("Key", bound=Hashable)
@@ -63,11 +72,6 @@ class FlowFrame:
         object.__setattr__(self, "key", (self.index, cover))
 
     @property
-    def taken_out(self) -> bytes | None:
-        """What tells bridges over the same frame apart."""
-        return None if self.bridged is None else np.packbits(self.bridged).tobytes()
-
-    @property
     def held(self) -> float:
         """Share of the cells that are not bridged and have structure in two directions."""
         across, along = self.power[..., 0], self.power[..., 1]
@@ -105,6 +109,7 @@ class Edge:
 
     Attributes:
         started: [h,w,2] targets from which the search started; None: free.
+        bridged: [h,w] cells that were taken out of the picture it starts in; None: none.
         searches: how often it was searched.
         blind: searched before geometry could be believed.
     """
@@ -112,6 +117,7 @@ class Edge:
     target: Array
     confidence: Array
     started: Array | None
+    bridged: npt.NDArray[np.bool_] | None = None
     searches: int = 1
     blind: bool = False
 
@@ -183,6 +189,22 @@ def set_out_from(
 ) -> bool:
     """Whether searches both ways began at about these starts: free as they, or within a pixel."""
     return all(_close(one.started, start) for one, start in zip(known, starts, strict=True))
+
+
+def taken_out_alike(
+    known: tuple[Edge, Edge], frames: tuple[FlowFrame, FlowFrame], share: float
+) -> bool:
+    """Whether cells taken out of both pictures were these, but for at most a share of each."""
+    for edge, frame in zip(known, frames, strict=True):
+        one, other = edge.bridged, frame.bridged
+        if one is other:
+            continue
+        cells = frame.power.shape[:2]
+        blank = np.zeros(cells, np.bool_)
+        changed = (blank if one is None else one) != (blank if other is None else other)
+        if changed.mean() > share:
+            return False
+    return True
 
 
 def _close(one: Array | None, other: Array | None) -> bool:

@@ -138,6 +138,15 @@ class FlowOptions:
             "le": 1.0,
         },
     )
+    bridge_change: float = field(
+        default=0.02,
+        metadata={
+            "help": "share of a picture's cells that may have been taken out of it or put back "
+            "since a pair of pictures was searched, before it is searched anew",
+            "ge": 0.0,
+            "le": 1.0,
+        },
+    )
     seeds: int = field(
         default=1500,
         metadata={
@@ -149,7 +158,7 @@ class FlowOptions:
         },
     )
     seeds_below: float = field(
-        default=0.33,
+        default=0.2,
         metadata={
             "help": "share of a picture's cells that stand still and have structure in two "
             "directions, below which points are matched before there is doubt, too "
