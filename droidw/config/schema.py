@@ -164,7 +164,7 @@ class FrontendConfig:
         "middle: the last but two, if its neighbours are nearer than twice the threshold",
     )
     again_below: float = opt(
-        0.63,
+        0.65,
         "agreement of all matches with poses and depths in the end below which the footage is "
         "tracked once more, without what the first time was found to move, if that is 2 % of the "
         "pictures or more (0: never, 1: however much agrees)",
