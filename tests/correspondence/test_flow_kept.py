@@ -28,10 +28,20 @@ def pair(frame):
     return call
 
 
-def ask(part, frames, columns, start=None):
-    """Both edges where uncertainty closes the first columns of both pictures."""
+def closing(frames, columns):
+    """A gate that is closed over the first columns."""
     gate = np.ones(frames[0].normal.shape[:2], np.float32)
     gate[:, :columns] = 0.0
+    return gate
+
+
+def ask(part, frames, columns, start=None):
+    """Both edges where uncertainty closes the first columns of both pictures."""
+    return ask_by(part, frames, closing(frames, columns), start)
+
+
+def ask_by(part, frames, gate, start=None):
+    """Both edges by this gate of both pictures."""
     without = tuple(bridge(f, gate, 0.5, 7, part.options.blur) for f in frames)
     return part.both_ways(*frames, start, start, fine=True, bridged=without)
 
@@ -96,19 +106,12 @@ def test_another_start_is_another_search(operator, pair, searches):
 def test_a_few_cells_more_or_less_need_no_new_search(operator, pair, searches, change, again):
     part = operator(bridge_change=change)
     frames, made = pair(part), searches(part)
-
-    def found(gate):
-        without = tuple(bridge(f, gate, 0.5, 7, part.options.blur) for f in frames)
-        return part.both_ways(*frames, None, None, fine=True, bridged=without)
-
-    gate = np.ones(frames[0].normal.shape[:2], np.float32)
-    gate[:, :4] = 0.0
-    found(gate)
+    gate = closing(frames, 4)
+    ask_by(part, frames, gate)
     made.clear()
     gate[:2, 4] = 0.0  # 2 of 300 cells more
-    found(gate)
+    ask_by(part, frames, gate)
     assert bool(made) is again
     made.clear()
-    gate[:, 4:6] = 0.0  # many more than when it was searched
-    found(gate)
+    ask(part, frames, 6)  # many more than when it was searched
     assert made

@@ -88,7 +88,6 @@ class FlowCorrespondence:
         self._full: Kept[_Pair, Array] = Kept(_FULL_FIELDS)
         self._grid: Kept[_Pair, Array] = Kept(_GRID_FIELDS)
         self._seeds = SeedBook(options.seeds)
-        self._same = options.bridge_change
         self._pairs: Kept[tuple[Hashable, ...], tuple[Edge, Edge]] = Kept(_PAIRS)
         self._plain: Kept[tuple[Hashable, ...], tuple[Found, Found]] = Kept(_PAIRS)
 
@@ -252,8 +251,8 @@ class FlowCorrespondence:
         c, d = bridged
         key = (a.key, b.key, fine, seeded)
         starts = start_ab, start_ba
-        known = self._pairs.get(key)
-        if known and set_out_from(known, starts) and taken_out_alike(known, bridged, self._same):
+        known, change = self._pairs.get(key), self.options.bridge_change
+        if known and set_out_from(known, starts) and taken_out_alike(known, bridged, change):
             return replace(known[0]), replace(known[1])
         whole = None if c.bridged is d.bridged is None else self._whole((a, b), starts, fine)
         flows = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from droidw_plugins.correspondence._flow_information import powers, slopes
-from droidw_plugins.correspondence._flow_types import Array, Kept
+from droidw_plugins.correspondence._flow_types import Array, Kept, held
 
 if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow_types import FlowFrame
@@ -42,10 +42,8 @@ _VOTES = 4
 _AROUND = 80.0
 _ALIKE = 2.0
 _ALIKE_FAR = 0.1
-# Power of the picture along the strongest edge around a point, as a share of that across it, from
-# which on it is held: a point on a line may lie anywhere along it and is usually off by half a
-# pixel, one that is held by a tenth. The Gaussian window in which it is told, pixels.
-_HELD, _HOLDS = 0.1, 3.0
+# The Gaussian window in which it is told whether a point is held, pixels.
+_HOLDS = 3.0
 # Pixels around what is closed whose points may be on its contour.
 _MARGIN = 2
 # How far a seed draws the flow around it, pixels, and how many seeds' worth of staying there is.
@@ -145,9 +143,7 @@ def _held(grey: Picture, at: Array) -> Mask:
     tensor = (cv2.GaussianBlur(p, (0, 0), _HOLDS) for p in (dx * dx, dy * dy, dx * dy))
     height, width = grey.shape
     x, y = np.rint(at).astype(np.int64).clip(0, (width - 1, height - 1)).T
-    across, along = powers(*(part[y, x] for part in tensor)).T
-    held: Mask = along > _HELD * across
-    return held
+    return held(powers(*(part[y, x] for part in tensor)))
 
 
 def matched(a: Points, b: Points) -> Seeds:

@@ -122,8 +122,9 @@ class FlowSession:
             a, b = request.payload(key[0]), request.payload(key[1])
             starts = start(rows.get(True)), start(rows.get(False))
             without = bridged.get(key[0], a), bridged.get(key[1], b)
-            poor = request.doubtful or min(f.held for f in without) < options.seeds_below
-            seeded = options.seeds > 0 and poor
+            seeded = options.seeds > 0 and (
+                request.doubtful or min(f.held for f in without) < options.seeds_below
+            )
             return lambda: self._owner.both_ways(
                 a, b, *starts, self._fine, bridged=without, seeded=seeded
             )

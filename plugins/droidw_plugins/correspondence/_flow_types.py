@@ -7,6 +7,7 @@ import zlib
 from collections import OrderedDict
 from collections.abc import Hashable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -19,6 +20,7 @@ __all__ = [
     "Found",
     "Kept",
     "Track",
+    "held",
     "set_out_from",
     "taken_out_alike",
 ]
@@ -31,7 +33,8 @@ Value = TypeVar("Value")
 # coarsest level, where a pixel is little.
 _SAME_START = 0.15
 # Power of the picture along the strongest edge of a cell from which on a match cannot slip there,
-# (grey levels per pixel)^2, and as a share of that across it.
+# (grey levels per pixel)^2, and of any place, as a share of that across it: a point on a line may
+# lie anywhere along it and is usually off by half a pixel, one that is held by a tenth.
 _SOME_POWER, _HELD = 1.0, 0.1
 # Frames that may be missing before the motion so far is forgotten.
 _LONGEST_GAP = 3
@@ -71,12 +74,11 @@ class FlowFrame:
         cover = 0 if self.covered is None else zlib.crc32(np.packbits(self.covered).tobytes())
         object.__setattr__(self, "key", (self.index, cover))
 
-    @property
+    @cached_property
     def held(self) -> float:
         """Share of the cells that are not bridged and have structure in two directions."""
-        across, along = self.power[..., 0], self.power[..., 1]
-        held = (along > _SOME_POWER) & (along > _HELD * across)
-        return float((held if self.bridged is None else held & ~self.bridged).mean())
+        cells = held(self.power) & (self.power[..., 1] > _SOME_POWER)
+        return float((cells if self.bridged is None else cells & ~self.bridged).mean())
 
     @property
     def sharp(self) -> npt.NDArray[np.uint8]:
@@ -182,6 +184,12 @@ class Kept(Generic[Key, Value]):
             self._values[key] = value
             while len(self._values) > self._most:
                 self._values.popitem(last=False)
+
+
+def held(power: Array) -> npt.NDArray[np.bool_]:
+    """Which places have structure in two directions, [...], by both powers [...,2] of each."""
+    enough: npt.NDArray[np.bool_] = power[..., 1] > _HELD * power[..., 0]
+    return enough
 
 
 def set_out_from(

@@ -45,7 +45,7 @@ class AffineSoftplusOptions(ObjectiveOptions):
         default=0.0,
         metadata={
             "help": "parameters start, and decay, at a fit of y = gain (p - movable_at); p is "
-            "how likely features find what can move by itself (0: not asked)",
+            "how much speaks for what can move by itself, by the features (0: not asked)",
             "ge": 0,
         },
     )
