@@ -79,9 +79,16 @@ class MotionFilterConfig:
     """Which frames become candidates for keyframes."""
 
     threshold: float = opt(1.25, "mean flow from the last keyframe, in grid cells", gt=0)
+    movable_above: float = opt(
+        0.1,
+        "cells of the last keyframe with more evidence than this for what can move by itself do "
+        "not tell how far a picture moved, where uncertainty begins with that (0: all do)",
+        ge=0,
+        le=1,
+    )
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
-        0.3,
+        0.4,
         "a frame in which less than this share of the cells is matched is taken at once",
         ge=0,
         le=1,

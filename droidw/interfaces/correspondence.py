@@ -115,6 +115,11 @@ class Correspondence(Protocol):
     what follows (`backend.points`), for which most of them must be right to a fifth of a pixel:
     leave out what lies on a line.
 
+    And it may have `aside(payload, cells)`: the payload as one whose `cells`, bool [h,w], do not
+    tell how far a picture moved. It is only given to `motion`, as the reference, and what can move
+    by itself is set aside so. `matched` is then the share of the picture that the other cells of it
+    have, as under the user's mask, unless hardly any are left.
+
     Attributes:
         stride, offset: the grid: cell (x, y) lies at pixel `stride * (x, y) + offset`.
     """

@@ -101,6 +101,9 @@ class UncertaintyModel(Protocol):
     known. It then has a method `begin(view, movable)`, which writes `view.uncertainty` of
     `view.frames`, the keyframes of the initialisation, from what the extractor's `movable` says of
     them, [N,h,w]. It is called once, before the first search, and only with such an extractor.
+    With `renews` it is told of every later keyframe, too: `renew(view, index, movable)`, with
+    `movable` [h,w] of keyframe `index` and without edges, is called just before its `append` and
+    writes no map.
     """
 
     fields: tuple[StoreField, ...]

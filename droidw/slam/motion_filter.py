@@ -30,6 +30,7 @@ class Encoded:
     Attributes:
         payload: of correspondence, of any frame. context: the same of a keyframe.
         features: [c,h,w]. prior: [h,w] inverse depth. Both only where they were made ahead.
+        movable: [h,w] in [0,1], how much speaks for it that a cell can move; where it was asked.
         plain: the same frame with nothing hidden, where something is while it is tracked.
         ready: when all of this is done on a GPU, see `Ahead`; None where it is done.
     """
@@ -39,6 +40,7 @@ class Encoded:
     context: Any = None
     features: Tensor | None = None
     prior: Tensor | None = None
+    movable: Tensor | None = None
     plain: Encoded | None = None
     ready: Any = None
 
@@ -79,7 +81,9 @@ class MotionFilter:
     ) -> None:
         self._correspondence = correspondence
         self._options = options
+        # The last candidate, and its payload as motion is measured from it.
         self._reference: Encoded | None = None
+        self._from: Any = None
         # Frames are counted from here; and the candidate of which the window has yet to decide.
         self._last_index = 0
         self._open: int | None = None
@@ -92,7 +96,7 @@ class MotionFilter:
         if self._reference is None:
             self._accept(current, forced=True)
             return Verdict(keep=True, forced=False, motion=None)
-        motion = self._correspondence.motion(self._reference.payload, current.payload)
+        motion = self._correspondence.motion(self._from, current.payload)
         options = self._options
         forced = options.force_every > 0 and self._gap(current.frame.index) >= options.force_every
         keep = motion.flow > options.threshold
@@ -107,6 +111,13 @@ class MotionFilter:
         if keep or forced:
             self._accept(current, forced)
         return Verdict(keep=keep or forced, forced=forced, motion=motion)
+
+    def set_aside(self, current: Encoded, cells: Tensor) -> None:
+        """What may move by itself in the frame just kept, bool [h,w], is not motion of a picture.
+
+        Only of a correspondence that has `aside`.
+        """
+        self._from = self._correspondence.aside(current.payload, cells)  # type: ignore[attr-defined]
 
     def settled(self, index: int, kept: bool) -> None:
         """Whether candidate `index` has become a keyframe for good: frames are counted from it."""
@@ -136,6 +147,7 @@ class MotionFilter:
 
     def _accept(self, current: Encoded, forced: bool) -> None:
         self._reference = current
+        self._from = current.payload
         self._lost = 0
         with self._window:
             if forced:  # the window may not drop it

@@ -16,10 +16,10 @@ from droidw.errors import InputError
 from droidw.events import Dispatcher, FrameTracked, KeyframeAdded, KeyframeRemoved, Progress
 from droidw.geometry.camera import Grid
 from droidw.geometry.se3 import inv
-from droidw.geometry.transfer import upload
 from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.slam.backend import Backend
 from droidw.slam.backwards import doubted
+from droidw.slam.cell_maps import CellMaps
 from droidw.slam.cloud import consistent_depth, static_cloud
 from droidw.slam.diagnosis import diagnose, parallax
 from droidw.slam.filler import Filler
@@ -31,7 +31,6 @@ from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.records import Outcome, keyframe_records
 from droidw.slam.streams import Ahead, nbytes
 from droidw.slam.timing import Stopwatch
-from droidw.solve.weights import unmasked
 
 if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig
@@ -91,7 +90,8 @@ class SlamSystem:
         self.grid = Grid.of(camera.height, camera.width, op.stride, op.offset)
         # The published code takes depth and features from pixel 8 x + 3, but its rays from 8 x.
         shifted = "droid-w" in config.compat and (op.stride, op.offset) == (8, 0)
-        self._picked = replace(self.grid, offset=3.0) if shifted else self.grid
+        picked = replace(self.grid, offset=3.0) if shifted else self.grid
+        self._maps = CellMaps(parts, self.grid, picked, device, self.clock)
         if min(self.grid.height, self.grid.width) < 3:
             raise InputError(
                 f"pictures of {camera.width}x{camera.height} px leave a grid of "
@@ -113,6 +113,8 @@ class SlamSystem:
         self._pool = ThreadPoolExecutor(1, "ahead") if threaded else None
         self._ahead = Ahead(device, threaded)
         self._filter = MotionFilter(op, config.motion_filter, threaded)
+        self._renews = self.optimiser.begins and getattr(parts.uncertainty, "renews", False)
+        self._aside = self.optimiser.begins and hasattr(op, "aside")
         self._times: list[float] = []
         self._indices: list[int] = []
         self._moved: list[float] = []
@@ -150,9 +152,9 @@ class SlamSystem:
             with self.clock("motion filter"):
                 verdict = self._filter.judge(current)
             if verdict.keep:
-                current = self._with_context(current)
+                current = self._with_movable(self._with_context(current))
             if verdict.keep and self._pool is not None:
-                features, prior = self._features(frame), self._prior(frame)
+                features, prior = self._maps.features(frame), self._maps.prior(frame)
                 current = replace(current, features=features, prior=prior)
             return replace(current, ready=self._ahead.ready()), verdict
 
@@ -174,10 +176,16 @@ class SlamSystem:
         context = op.context(current.payload, current.frame, self.grid)
         return replace(current, context=context, plain=plain)
 
-    def _features(self, frame: Frame) -> Tensor:
-        with self.clock("features"):
-            image = upload(frame.image, self.store.device)
-            return self.parts.features.extract(image, self._picked)
+    def _with_movable(self, current: Encoded) -> Encoded:
+        """What can move in a keyframe, where that is asked of every one."""
+        above = self.config.motion_filter.movable_above
+        aside = self._aside and above > 0
+        if not (self._renews or aside):
+            return current
+        movable = self._maps.movable(current.frame)
+        if aside:
+            self._filter.set_aside(current, movable > above)
+        return replace(current, movable=movable)
 
     def _encode(self, frame: Frame) -> Encoded:
         with self.clock("encode"):
@@ -185,7 +193,13 @@ class SlamSystem:
 
     def _push(self, current: Encoded, verdict: Verdict) -> bool:
         frame = current.frame
-        made = current.payload, current.context, current.features, current.prior
+        made = (
+            current.payload,
+            current.context,
+            current.features,
+            current.prior,
+            current.movable,
+        )
         plain = current.plain
         whole = None if plain is None else (plain.payload, plain.context)
         self._ahead.take(current.ready, made, whole)
@@ -223,17 +237,20 @@ class SlamSystem:
     def _append(self, current: Encoded) -> int:
         frame, parts, store = current.frame, self.parts, self.store
         pose, disp = self.frontend.guess(frame.time)
-        features = self._features(frame) if current.features is None else current.features
-        prior = self._prior(frame) if current.prior is None else current.prior
+        features = self._maps.features(frame) if current.features is None else current.features
+        prior = self._maps.prior(frame) if current.prior is None else current.prior
         pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
         info = KeyframeInfo(
             frame.index, frame.time, frame.name, pixels.cpu().numpy(), current.context
         )
         if current.plain is not None:
-            info.whole = current.plain.context, self._unmasked(current.plain.frame)
-        known = {"unmasked": self._unmasked(frame)}
-        if self.optimiser.begins and not self.frontend.initialised:
-            known["movable"] = self._movable(frame)
+            info.whole = current.plain.context, self._maps.unmasked(current.plain.frame)
+        known = {"unmasked": self._maps.unmasked(frame)}
+        movable = current.movable
+        if movable is None and self.optimiser.begins and not self.frontend.initialised:
+            movable = self._maps.movable(frame)
+        if movable is not None:
+            known["movable"] = movable
         number = store.append(
             info,
             T_cw=pose,
@@ -243,31 +260,11 @@ class SlamSystem:
             **known,
         )
         with self.clock("uncertainty"):
-            parts.uncertainty.append(self.optimiser.view(), number)
+            view = self.optimiser.view()
+            if self._renews and self.optimiser.begun:
+                parts.uncertainty.renew(view, number, movable)  # type: ignore[attr-defined]
+            parts.uncertainty.append(view, number)
         return number
-
-    def _unmasked(self, frame: Frame) -> Tensor:
-        """What the frame's mask leaves of each cell, [h,w] in [0,1]."""
-        if frame.mask is None:
-            return self.store.disps.new_ones(self.grid.height, self.grid.width)
-        return unmasked(self.grid.covered(upload(frame.mask, self.store.device)))
-
-    def _movable(self, frame: Frame) -> Tensor:
-        with self.clock("features"):
-            image = upload(frame.image, self.store.device)
-            found: Tensor = self.parts.features.movable(image, self._picked)  # type: ignore[attr-defined]
-            return found
-
-    def _prior(self, frame: Frame) -> Tensor:
-        device = self.store.device
-        with self.clock("depth prior"):
-            blank = torch.zeros(self.grid.height, self.grid.width, device=device)
-            prediction = self.parts.depth.predict(frame)
-            if prediction is None:
-                return blank
-            depth = self._picked.sample(upload(prediction.depth, device), mode="nearest")
-            known = torch.isfinite(depth) & (depth > 0)
-            return torch.where(known, 1.0 / depth.clamp_min(1e-6), blank)
 
     # -- finishing -------------------------------------------------------------------------
 

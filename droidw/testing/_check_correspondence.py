@@ -70,6 +70,7 @@ def correspondence(subject: Subject) -> None:
             f"two operators of one seed answer differently for {label}",
         )
         _motion(subject, part, payloads)
+        _aside(subject, part, payloads, grid)
         _points(subject, part, payloads, grid, (rows, columns))
 
 
@@ -250,6 +251,29 @@ def _motion(subject: Subject, part: Any, payloads: list[Any]) -> None:
         still.flow <= near.flow < far.flow,
         f"motion does not grow with the distance of frames: {near.flow:.2f} cells after "
         f"3 frames, {far.flow:.2f} after 6",
+    )
+
+
+def _aside(subject: Subject, part: Any, payloads: list[Any], grid: Grid) -> None:
+    """Cells that are not to tell how far a picture moved, where the part can set them aside."""
+    aside = getattr(part, "aside", None)
+    if aside is None:
+        return
+    cells = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=subject.device)
+    with subject.calling("aside"):
+        same_as_ever = part.motion(aside(payloads[0], cells), payloads[1])
+        cells[:, : grid.width // 2] = True
+        half = part.motion(aside(payloads[0], cells), payloads[1])
+    whole = part.motion(payloads[0], payloads[1])
+    subject.expect(
+        "aside",
+        same_as_ever == whole,
+        f"with no cell set aside motion is {same_as_ever!r}, and {whole!r} without asking",
+    )
+    subject.expect(
+        "aside",
+        0 <= half.matched < whole.matched and np.isfinite(half.flow),
+        f"with half of the cells set aside motion is {half!r}, and {whole!r} with all",
     )
 
 

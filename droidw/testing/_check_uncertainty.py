@@ -42,6 +42,8 @@ def uncertainty_model(subject: Subject) -> None:
         )
     if getattr(part, "begins", False):
         _begin(subject)
+    if getattr(part, "renews", False):
+        _renew(subject)
     _state(subject)
 
 
@@ -66,6 +68,38 @@ def _begin(subject: Subject) -> None:
     with subject.calling("update after begin"):
         part.update(view)
     _maps(subject, view, "after begin and an update")
+
+
+def _renew(subject: Subject) -> None:
+    """A model that is told of later keyframes, too, goes on and keeps what it was told."""
+    first, second = subject.build(seed=3), subject.build(seed=4)
+    view = _view(subject, first, 24, torch.float32)
+    movable = torch.linspace(0, 1, _W, device=subject.device).expand(_N, _H, _W).contiguous()
+    for index in range(_N - 1):
+        first.append(_without_edges(view), index)
+    first.begin(_without_edges(view), movable)
+    before, given = snapshot(view), snapshot(movable)
+    with subject.calling("renew"):
+        first.renew(_without_edges(view), _N - 1, movable[_N - 1])
+    _inputs_kept(subject, before, view, "renew")
+    subject.unchanged("what can move, given to renew", given, movable)
+    subject.expect("only-asked", same(before.uncertainty, view.uncertainty), "renew changed a map")
+    copied = dataclasses.replace(
+        view,
+        uncertainty=view.uncertainty.clone(),
+        fields={name: value.clone() for name, value in view.fields.items()},
+    )
+    with subject.calling("load_state_dict, append and renew after renew"):
+        second.load_state_dict(snapshot(first.state_dict()))
+        for model, seen in ((first, view), (second, copied)):
+            model.renew(_without_edges(seen), _N - 1, movable[0])
+            model.append(_without_edges(seen), _N - 1)
+    _maps(subject, view, "after renew and append")
+    subject.expect(
+        "state",
+        same(view.uncertainty, copied.uncertainty),
+        "a model restored from state_dict() is not renewed as the original",
+    )
 
 
 def _fields(subject: Subject, part: Any) -> None:

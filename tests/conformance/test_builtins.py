@@ -77,7 +77,9 @@ def test_part_keeps_the_contract_of_its_kind(entry, device, tmp_path):
 
 def test_a_model_that_begins_with_what_can_move_keeps_the_contract(device):
     [entry] = [e for e in ENTRIES if e.component.name == "affine-softplus"]
-    options = entry.component.options(movable_gain=8.0, learn_majority=0.6, smooth=1)
+    options = entry.component.options(
+        movable_gain=8.0, movable_keep=0.9, learn_majority=0.6, smooth=1
+    )
     check("uncertainty", entry.component, device, options)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import torch
 
 from droidw.geometry.camera import Grid
 from droidw.interfaces.correspondence import Motion
@@ -32,7 +33,14 @@ def test_no_tiles_are_all_cells_in_order():
 
 
 def seen(operator, frame, wall: float, thing: float, tiles: int) -> float:
-    """Motion of a bare wall with a few lines, and of a thing before it, cells of 8 pixels each."""
+    return measured(operator, frame, wall, thing, tiles, lambda aside: None).flow
+
+
+def measured(operator, frame, wall, thing, tiles, choose) -> Motion:
+    """Motion of a bare wall with a few lines, and of a thing before it, cells of 8 pixels each.
+
+    `choose` is given which cells show the thing, and says which are set aside; None: none.
+    """
     grey = np.full((HEIGHT, WIDTH), 150.0, dtype=np.float32)
     for x in range(-20, WIDTH, 44):
         cv2.line(grey, (x, 0), (x + 20, HEIGHT), 100.0, 2)
@@ -45,7 +53,12 @@ def seen(operator, frame, wall: float, thing: float, tiles: int) -> float:
     moved[..., 0] = wall * part.stride
     moved[3:16, 7:19, 0] = thing * part.stride
     agrees = np.ones(moved.shape[:2], dtype=np.float32)
-    return picture_motion(moved, agrees, payload, part.options).flow
+    cells = np.zeros(moved.shape[:2], dtype=bool)
+    cells[2:17, 6:20] = True
+    aside = choose(cells)
+    if aside is not None:
+        payload = part.aside(payload, torch.from_numpy(aside))
+    return picture_motion(moved, agrees, payload, part.options)
 
 
 def test_what_moves_with_the_camera_hides_less_of_its_motion(operator, frame):
@@ -55,6 +68,20 @@ def test_what_moves_with_the_camera_hides_less_of_its_motion(operator, frame):
 
 def test_before_a_camera_at_rest_most_of_the_picture_has_the_say(operator, frame):
     assert seen(operator, frame, wall=0.0, thing=1.0, tiles=6) == 0.0
+
+
+def test_what_may_move_by_itself_does_not_count(operator, frame):
+    whole = measured(operator, frame, 1.0, 0.1, 6, lambda cells: None)
+    wall = measured(operator, frame, 1.0, 0.1, 6, lambda cells: cells)
+    assert whole.flow < 0.9 and wall.flow == 1.0
+    assert wall.matched < 0.6 * whole.matched  # as where the user's mask covers it
+    none = measured(operator, frame, 1.0, 0.1, 6, lambda cells: cells & False)
+    assert none == whole
+
+
+def test_where_nearly_all_may_move_all_of_it_counts(operator, frame):
+    whole = measured(operator, frame, 1.0, 0.1, 6, lambda cells: None)
+    assert measured(operator, frame, 1.0, 0.1, 6, lambda cells: cells | True) == whole
 
 
 def test_a_blank_picture_tells_no_motion(operator, frame):

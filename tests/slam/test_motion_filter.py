@@ -73,3 +73,27 @@ def test_stopping_early_leaves_nobody_waiting():
         ahead = look_ahead(judged(judge), 32, pool, judge.close)
         assert [next(ahead)[0] for _ in range(4)] == [0, 1, 2, 3]
         ahead.close()  # hangs if the thread waits for what the window says of frame 3
+
+
+class Counting(Table):
+    """Correspondence that is asked from which payload it measures."""
+
+    def __init__(self):
+        self.asked = []
+
+    def aside(self, payload, cells):
+        return (payload, cells)
+
+    def motion(self, reference, current):
+        self.asked.append(reference)
+        return Motion(9.0 if current == 2 else 0.0, 1.0)
+
+
+def test_what_is_set_aside_of_a_keyframe_holds_until_the_next():
+    table, blank = Counting(), torch.zeros(0)
+    judge = MotionFilter(table, MotionFilterConfig())
+    frames = [Encoded(Frame(k, k / 30, blank, blank), k) for k in range(4)]
+    assert judge.judge(frames[0]).keep
+    judge.set_aside(frames[0], "cells")
+    assert [judge.judge(frame).keep for frame in frames[1:]] == [False, True, False]
+    assert table.asked == [(0, "cells"), (0, "cells"), 2]

@@ -11,7 +11,8 @@ import torch
 from droidw.interfaces.uncertainty import UncertaintyView
 from droidw.plugin.component import BuildContext
 from droidw.solve.weights import gate
-from droidw_plugins.uncertainty._affine import AffineSoftplus, affine_fit
+from droidw_plugins.uncertainty._affine import AffineSoftplus
+from droidw_plugins.uncertainty._regression import Regression
 from droidw_plugins.uncertainty.affine_softplus import AffineSoftplusOptions
 
 Start = Callable[..., UncertaintyView]
@@ -30,17 +31,6 @@ def _likely(view: UncertaintyView) -> torch.Tensor:
     movable = torch.full_like(view.uncertainty, 0.2)
     movable[:, :, 4:] = 0.8
     return movable
-
-
-def test_fit_is_ridge_regression() -> None:
-    draw = torch.Generator().manual_seed(0)
-    rows = torch.randn(2, 50, 3, generator=draw, dtype=torch.float64)
-    y = torch.randn(2, 50, generator=draw, dtype=torch.float64)
-    theta = affine_fit(rows, y).requires_grad_()
-    found = (rows @ theta[:-1] + theta[-1] - y).square().mean()
-    square = (rows.square().mean((0, 1)).sum() + 1) / 4
-    (slope,) = torch.autograd.grad(found + 0.1 * square * theta.square().sum(), theta)
-    assert float(slope.abs().max()) < 1e-12
 
 
 def test_begins_with_what_can_move(started: Start) -> None:
@@ -78,6 +68,35 @@ def test_a_restored_model_knows_where_it_began(started: Start) -> None:
     )
     model.update(view)
     other.update(copied)
+    assert torch.equal(model.state_dict()["theta"], other.state_dict()["theta"])
+
+
+def test_what_comes_in_later_takes_part_in_the_start(started: Start) -> None:
+    model = _model(movable_gain=8.0, movable_keep=0.9)
+    view = started(model)
+    assert model.renews and not _model(movable_gain=8.0).renews and not _model().renews
+    before = model.state_dict()
+    model.renew(view, 2, _likely(view)[2])  # before it began there is nothing to renew
+    assert torch.equal(model.state_dict()["theta"], before["theta"]) and "home" not in before
+    first = dataclasses.replace(view, frames=view.frames[:1])
+    model.begin(first, _likely(view))
+    state = model.state_dict()
+    learned = torch.linspace(-0.1, 0.1, len(state["home"]))
+    model.load_state_dict({**state, "theta": state["home"] + learned})
+    model.renew(view, 1, 0.4 * _likely(view)[1])
+    renewed = model.state_dict()
+    assert torch.allclose(renewed["theta"] - renewed["home"], learned, atol=1e-5)
+    # What the second keyframe says counts, and nine tenths of what the first one did.
+    rows = view.features[:2].flatten(2).transpose(1, 2)
+    y = torch.stack([_likely(view)[0], 0.4 * _likely(view)[1]]).flatten(1)
+    due = Regression.of(rows[:1], y[:1]).and_then(Regression.of(rows[1:], y[1:]), 0.9).theta()
+    due = 8.0 * due
+    due[-1] -= 8.0 * 0.55
+    assert torch.allclose(renewed["home"], due, atol=1e-4)
+    other = _model(movable_gain=8.0, movable_keep=0.9)
+    other.load_state_dict(renewed)
+    for each in (model, other):
+        each.renew(view, 2, _likely(view)[2])
     assert torch.equal(model.state_dict()["theta"], other.state_dict()["theta"])
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from droidw.geometry.projective import pixel_grid
 from droidw.interfaces.correspondence import Motion, Purpose
 from droidw_plugins.correspondence._flow_information import (
+    agreement,
     information,
     likeness,
     sample,
@@ -46,6 +47,8 @@ from droidw_plugins.correspondence._flow_types import (
 )
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from droidw.geometry.camera import Grid
     from droidw.slam.frame import Frame
     from droidw_plugins.correspondence.flow import FlowOptions
@@ -130,11 +133,15 @@ class FlowCorrespondence:
         flow = self._search(reference, current, start)
         self._latest = (reference.key, current.key), flow
         moved = self._moved(reference, current, lambda a, b: flow)
-        agrees = self._agreement(reference, current, moved)
+        agrees = agreement(reference, current, moved)
         motion = picture_motion(moved, agrees, reference, self.options)
         known = motion.matched > _TRACKED
         self._track = Track.after(self._track, reference, current, flow) if known else None
         return motion
+
+    def aside(self, payload: FlowFrame, cells: Tensor) -> FlowFrame:
+        """The frame, as one whose `cells`, bool [h,w], do not tell how far a picture moved."""
+        return replace(payload, aside=cells.cpu().numpy())
 
     def session(self, purpose: Purpose = "window") -> FlowSession:
         """Fresh edge state; flows already measured are shared between sessions."""
@@ -201,28 +208,11 @@ class FlowCorrespondence:
         self._grid.put(key, moved)
         return moved
 
-    def _agreement(self, a: FlowFrame, b: FlowFrame, moved: Array) -> Array:
-        """Agreement [h,w] in brightness at both ends of the flow, and 0 outside the picture."""
-        there = a.centres + moved
-        height, width = a.grey.shape
-        inside = (
-            (there[..., 0] >= 0)
-            & (there[..., 1] >= 0)
-            & (there[..., 0] <= width - 1)
-            & (there[..., 1] <= height - 1)
-        )
-        difference = np.abs(sample(a.grey, a.centres) - sample(b.grey, there))
-        # A change of brightness by 10 grey levels is worth two pixels of position where the
-        # picture is steep and says nothing where it is flat: texture decides there.
-        tolerance = 6.0 + 1.5 * a.texture.max(axis=-1)
-        agreement: Array = inside / (1.0 + (difference / tolerance) ** 2)
-        return agreement.astype(np.float32)
-
     def one_way(self, a: FlowFrame, b: FlowFrame) -> Edge:
         """Edge a -> b without the way back, exact at full size."""
         found = self._moved(a, b, self._search)
         moved = polished(a.grey, b.grey, a.centres, found, self.options.fill_window)
-        agrees = self._agreement(a, b, moved)
+        agrees = agreement(a, b, moved)
         confidence = information(a, agrees, agrees, self.options)
         target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, None)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from droidw_plugins.correspondence.flow import FlowOptions
 
 __all__ = [
+    "agreement",
     "information",
     "likeness",
     "powers",
@@ -175,6 +176,24 @@ def turned(frame: FlowFrame, flow: Array, reach: int) -> Array:
     normal = np.stack([there[..., 1], -there[..., 0]], -1) / length[..., None]
     result: Array = np.where(alike[..., None], normal, frame.normal)
     return result
+
+
+def agreement(a: FlowFrame, b: FlowFrame, moved: Array) -> Array:
+    """Agreement [h,w] in brightness at both ends of the flow, and 0 outside the picture."""
+    there = a.centres + moved
+    height, width = a.grey.shape
+    inside = (
+        (there[..., 0] >= 0)
+        & (there[..., 1] >= 0)
+        & (there[..., 0] <= width - 1)
+        & (there[..., 1] <= height - 1)
+    )
+    difference = np.abs(sample(a.grey, a.centres) - sample(b.grey, there))
+    # A change of brightness by 10 grey levels is worth two pixels of position where the
+    # picture is steep and says nothing where it is flat: texture decides there.
+    tolerance = 6.0 + 1.5 * a.texture.max(axis=-1)
+    agrees: Array = inside / (1.0 + (difference / tolerance) ** 2)
+    return agrees.astype(np.float32)
 
 
 def information(

@@ -19,6 +19,8 @@ __all__ = ["middles", "picture_motion"]
 _AGREES = 0.3
 # Matched cells of a tile that say how it moved.
 _SOME = 2
+# Share of the cells that has to be left besides those that may move by themselves.
+_LEFT = 0.05
 
 
 def picture_motion(
@@ -36,6 +38,8 @@ def picture_motion(
     usable = textured & (agrees > _AGREES)
     if not usable.any():
         return Motion(0.0, 0.0)
+    if reference.aside is not None and (usable & ~reference.aside).mean() > _LEFT:
+        usable &= ~reference.aside
     length = middles(np.hypot(moved[..., 0], moved[..., 1]), usable, options.motion_tiles)
     at_rest = (length < options.still).mean() > options.still_share
     flow = float(np.median(length) if at_rest else length.mean())

@@ -13,12 +13,10 @@ from droidw.interfaces.uncertainty import StoreField, UncertaintyReport, Uncerta
 from droidw.plugin.component import BuildContext
 from droidw_plugins.uncertainty import _objective as objective
 from droidw_plugins.uncertainty._consistency import Consistency, Numbers
+from droidw_plugins.uncertainty._regression import Regression
 from droidw_plugins.uncertainty.affine_softplus import AffineSoftplusOptions
 
-__all__ = ["AffineSoftplus", "affine", "affine_fit", "affine_gradient"]
-
-# Share of the mean square of a feature that is added to all, when y is fitted to something.
-_RIDGE = 0.1
+__all__ = ["AffineSoftplus", "affine", "affine_gradient"]
 
 
 def affine(rows: Tensor, theta: Tensor) -> Tensor:
@@ -34,16 +32,6 @@ def affine_gradient(weight: Tensor, rows: Tensor, bias: bool = True) -> Tensor:
     """
     slope = weight.flatten() @ rows.flatten(0, 1)
     return torch.cat([slope, (weight.sum() if bias else weight.new_zeros(()))[None]])
-
-
-def affine_fit(rows: Tensor, y: Tensor) -> Tensor:
-    """theta [C+1] whose map of rows [n,P,C] comes closest to y [n,P], by ridge regression."""
-    ones = rows.new_ones(rows.shape[0] * rows.shape[1], 1)
-    design = torch.cat([rows.flatten(0, 1), ones], dim=1)
-    square = design.T @ design / len(design)
-    square.diagonal().add_(_RIDGE * square.diagonal().mean())
-    theta: Tensor = torch.linalg.solve(square, design.T @ y.flatten() / len(design))
-    return theta
 
 
 @dataclass(frozen=True)
@@ -66,7 +54,7 @@ class AffineSoftplus:
         options: see `AffineSoftplusOptions`.
         context: device, and the seed of the random start of theta.
     Attributes:
-        fields: see `Consistency.fields`. begins: whether `begin` is wanted.
+        fields: see `Consistency.fields`. begins, renews: whether `begin` and `renew` are wanted.
     """
 
     def __init__(self, options: AffineSoftplusOptions, context: BuildContext) -> None:
@@ -78,8 +66,10 @@ class AffineSoftplus:
         self._generator = torch.Generator().manual_seed(context.seed)
         self._theta: Tensor | None = None
         self._home: Tensor | float = 0.0
+        self._seen: Regression | None = None
         self._mapped: _Mapped | None = None
         self.begins = options.movable_gain > 0
+        self.renews = self.begins and options.movable_keep > 0
 
     @torch.no_grad()
     def begin(self, view: UncertaintyView, movable: Tensor) -> None:
@@ -92,14 +82,35 @@ class AffineSoftplus:
         first, last = min(known), max(known) + 1
         rows = self._objective.rows(view, first, last)
         options = self._options
-        theta = options.movable_gain * affine_fit(rows, movable[first:last].flatten(1))
-        theta[-1] -= options.movable_gain * options.movable_at
-        self._theta = self._home = theta
+        self._seen = Regression.of(rows, movable[first:last].flatten(1))
+        self._theta = self._home = theta = self._fitted(self._seen)
         self._objective.maps.begun = True
         self._mapped = None
         u = objective.softplus(affine(rows, theta), options.softplus_offset)
         u = u[view.frames - first].view(-1, *view.uncertainty.shape[1:])
         self._objective.maps.write(view, u)
+
+    @torch.no_grad()
+    def renew(self, view: UncertaintyView, index: int, movable: Tensor) -> None:
+        """Let a later keyframe, with what can move in it [h,w], take part in what theta decays to.
+
+        What was learned since the start is kept: theta moves along.
+        """
+        if self._seen is None or self._theta is None:
+            return
+        rows = view.features[index].flatten(1).T[None].float()
+        later = Regression.of(rows, movable.flatten()[None])
+        self._seen = self._seen.and_then(later, self._options.movable_keep)
+        home = self._fitted(self._seen)
+        self._theta, self._home = self._theta + (home - self._home), home
+        self._mapped = None
+
+    def _fitted(self, seen: Regression) -> Tensor:
+        """theta [C+1] of what can move, by all that was seen."""
+        options = self._options
+        theta = options.movable_gain * seen.theta()
+        theta[-1] -= options.movable_gain * options.movable_at
+        return theta
 
     @torch.no_grad()
     def append(self, view: UncertaintyView, index: int) -> None:
@@ -158,12 +169,14 @@ class AffineSoftplus:
     def state_dict(self) -> dict[str, Any]:
         """`theta` [C+1] (weights, then bias), or an empty dict before the first keyframe.
 
-        With `movable_gain` also `home` [C+1], where it started.
+        With `movable_gain` also `home` [C+1], what it decays to, and the sums it was fitted to.
         Where similarities are calibrated, also what `MatchScale.state_dict` gives.
         """
         state = self._objective.scale.state_dict()
         if isinstance(self._home, Tensor):
             state["home"] = self._home.clone()
+        if self._seen is not None:
+            state["seen"] = self._seen.state_dict()
         return {} if self._theta is None else {"theta": self._theta.clone(), **state}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -173,6 +186,8 @@ class AffineSoftplus:
         self._mapped = None
         self._theta = state["theta"].clone().to(self._device) if state else None
         self._home = state["home"].clone().to(self._device) if "home" in state else 0.0
+        seen = state.get("seen")
+        self._seen = seen and Regression(**{k: v.clone().to(self._device) for k, v in seen.items()})
         self._objective.maps.begun = "home" in state
 
     def _parameters(self, view: UncertaintyView) -> Tensor:

@@ -49,6 +49,15 @@ class AffineSoftplusOptions(ObjectiveOptions):
             "ge": 0,
         },
     )
+    movable_keep: float = field(
+        default=0.0,
+        metadata={
+            "help": "fit anew at every keyframe, with this share of what earlier ones counted "
+            "(0: the keyframes of the initialisation only)",
+            "ge": 0,
+            "le": 1,
+        },
+    )
     movable_at: float = field(
         default=0.55,
         metadata={"help": "p at which y starts at 0", "ge": 0, "le": 1},

@@ -1,0 +1,69 @@
+"""What features, the depth prior and the user's mask say of the cells of one frame."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from droidw.geometry.transfer import upload
+from droidw.solve.weights import unmasked
+
+if TYPE_CHECKING:
+    from droidw.geometry.camera import Grid
+    from droidw.slam.frame import Frame
+    from droidw.slam.optimise import Parts
+    from droidw.slam.timing import Stopwatch
+
+__all__ = ["CellMaps"]
+
+
+class CellMaps:
+    """Asks the parts of a run for maps of a frame; keeps nothing of it.
+
+    Args:
+        parts: the plugins, built.
+        grid: of the cells.
+        picked: the same, where features and depth are to be taken.
+        device: where the maps are wanted.
+        clock: where the time of each part is added up.
+    """
+
+    def __init__(
+        self, parts: Parts, grid: Grid, picked: Grid, device: torch.device, clock: Stopwatch
+    ) -> None:
+        self._parts = parts
+        self._grid = grid
+        self._picked = picked
+        self._device = device
+        self._clock = clock
+
+    def features(self, frame: Frame) -> Tensor:
+        """[C,h,w] of the extractor."""
+        with self._clock("features"):
+            return self._parts.features.extract(upload(frame.image, self._device), self._picked)
+
+    def movable(self, frame: Frame) -> Tensor:
+        """[h,w] in [0,1], how much speaks for what can move; of an extractor that has `movable`."""
+        with self._clock("features"):
+            image = upload(frame.image, self._device)
+            found: Tensor = self._parts.features.movable(image, self._picked)  # type: ignore[attr-defined]
+            return found
+
+    def prior(self, frame: Frame) -> Tensor:
+        """[h,w] inverse depth, 0 where it is not known."""
+        with self._clock("depth prior"):
+            blank = torch.zeros(self._grid.height, self._grid.width, device=self._device)
+            prediction = self._parts.depth.predict(frame)
+            if prediction is None:
+                return blank
+            depth = self._picked.sample(upload(prediction.depth, self._device), mode="nearest")
+            known = torch.isfinite(depth) & (depth > 0)
+            return torch.where(known, 1.0 / depth.clamp_min(1e-6), blank)
+
+    def unmasked(self, frame: Frame) -> Tensor:
+        """[h,w] in [0,1], what the frame's mask leaves of each cell."""
+        if frame.mask is None:
+            return torch.ones(self._grid.height, self._grid.width, device=self._device)
+        return unmasked(self._grid.covered(upload(frame.mask, self._device)))
