@@ -86,6 +86,18 @@ CLIPS = {
     "hospital_runner_camel": Made(
         _HOSPITAL, (Mover(_RUNNER, 1.2, later=20), Mover(_CAMEL, 0.5, -0.25))
     ),
+    # Made later, after the masks and paths of those above had been looked at.
+    "kitchen_car": Made(_KITCHEN, (Mover(_CAR, mirrored=True, later=5),)),
+    "kitchen_goat_camel": Made(
+        _KITCHEN, (Mover(_GOAT, 0.8, 0.2), Mover(_CAMEL, 0.7, -0.2)), first=50, last=250
+    ),
+    "kitchen_middle_static": Made(_KITCHEN, (), first=50, last=250),
+    "hospital_goat_small": Made(_HOSPITAL, (Mover(_GOAT, 0.7, -0.15, True, 20),)),
+    "hospital_runner_large": Made(_HOSPITAL, (Mover(_RUNNER, 1.4, 0.1, True, 10),)),
+    "hospital_480": Made(_HOSPITAL, (Mover(_RUNNER, later=30),), (480, 360), 20),
+    "hospital_480_static": Made(_HOSPITAL, (), (480, 360), 20),
+    "hospital_car_small": Made(_HOSPITAL, (Mover(_CAR, 0.7, 0.2, later=10),), first=30),
+    "hospital_middle_static": Made(_HOSPITAL, (), first=30),
 }
 
 

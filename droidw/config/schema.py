@@ -89,7 +89,8 @@ class MotionFilterConfig:
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
         0.4,
-        "a frame in which less than this share of the cells is matched is taken at once",
+        "share of the cells below which keyframes come sooner: with the half of it matched from "
+        "half of `threshold` on (0: always from the whole of it)",
         ge=0,
         le=1,
     )

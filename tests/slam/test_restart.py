@@ -103,7 +103,8 @@ def turns_off(T_cw, truth):
 
 def look(made):
     matches, gates = matched_points(made), made.gates()
-    return contradicted(Path.of(made.store), matches, made.store.intrinsics, gates)
+    times = torch.arange(len(made.store), dtype=torch.float64)
+    return contradicted(Path.of(made.store), matches, made.store.intrinsics, gates, times)
 
 
 def test_points_are_rays_of_keyframes_that_are_near(optimiser, truth):
