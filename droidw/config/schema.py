@@ -80,17 +80,17 @@ class MotionFilterConfig:
 
     threshold: float = opt(1.25, "mean flow from the last keyframe, in grid cells", gt=0)
     movable_above: float = opt(
-        0.1,
+        0.0,
         "cells of the last keyframe with more evidence than this for what can move by itself do "
-        "not tell how far a picture moved, where uncertainty begins with that (0: all do)",
+        "not tell how far a picture moved, where uncertainty begins with that (0: all do; 0.1 "
+        "makes keyframes nearer where something hides the motion of the camera)",
         ge=0,
         le=1,
     )
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
-        0.4,
-        "share of the cells below which keyframes come sooner: with the half of it matched from "
-        "half of `threshold` on (0: always from the whole of it)",
+        0.3,
+        "a frame in which less than this share of the cells is matched is taken at once",
         ge=0,
         le=1,
     )

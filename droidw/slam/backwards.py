@@ -196,9 +196,7 @@ class _SecondLook:
         """
         optimiser, passes = self.optimiser, self.config.backend.passes[-_FEW_PASSES:]
         gates = optimiser.gates()
-        store = optimiser.store
-        times = torch.tensor(store.times(), dtype=torch.float64)
-        motions = contradicted(self.kept, matches, store.intrinsics, gates, times)
+        motions = contradicted(self.kept, matches, optimiser.store.intrinsics, gates)
         if not motions:
             return False
         known = support(optimiser, self.kept)

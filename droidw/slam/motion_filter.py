@@ -99,10 +99,10 @@ class MotionFilter:
         motion = self._correspondence.motion(self._from, current.payload)
         options = self._options
         forced = options.force_every > 0 and self._gap(current.frame.index) >= options.force_every
-        # The less of a picture tells its motion, the nearer keyframes have to be to hold it.
-        share = min(motion.matched / options.min_matched, 1.0) if options.min_matched else 1.0
-        keep = motion.flow > options.threshold * share
-        if motion.matched < options.lost_below:
+        keep = motion.flow > options.threshold
+        if motion.matched < options.min_matched and motion.matched >= options.lost_below:
+            keep = True
+        elif motion.matched < options.lost_below:
             # A blank or broken picture teaches nothing; a lasting change of view does.
             self._lost += 1
             keep = self._lost >= options.patience

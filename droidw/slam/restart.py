@@ -88,7 +88,7 @@ def matched_points(optimiser: Optimiser) -> PointMatches | None:
 
 
 def contradicted(
-    path: Path, matches: PointMatches, intrinsics: Tensor, gates: Tensor, times: Tensor
+    path: Path, matches: PointMatches, intrinsics: Tensor, gates: Tensor
 ) -> dict[int, Tensor]:
     """Motions [7] that explain far more of the matches, by interval between keyframes.
 
@@ -97,11 +97,7 @@ def contradicted(
 
     Args:
         intrinsics: [4] of the grid. gates: [N,h,w] in [0,1].
-        times: [N] float64 of the keyframes; what is steady is so per time, where they all differ.
     """
-    spans = (times[1:] - times[:-1]).abs()
-    if not bool((spans > 0).all()):
-        spans = torch.ones_like(spans)
     T = path.T_cw.double().cpu()
     count = len(T)
     known = mul(T[1:], inv(T[:-1]))
@@ -113,8 +109,7 @@ def contradicted(
         if not len(inside):
             continue
         cost = float(disagreement(led(known[first:last]), inside).sum())
-        span = spans[first:last]
-        fits = [steady_fit(start[first:last], inside, span) for start in (known, twins)]
+        fits = [steady_fit(start[first:last], inside) for start in (known, twins)]
         costs = [disagreement(led(fit), inside) for fit in fits]
         motions, least = min(zip(fits, costs, strict=True), key=lambda pair: float(pair[1].sum()))
         less = cost - float(least.sum())

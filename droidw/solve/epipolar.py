@@ -154,35 +154,29 @@ def planar_twin(motions: Tensor, planes: Tensor) -> Tensor:
     return torch.cat([moved, turn[:, 3:]], dim=1)
 
 
-def steady_fit(motions: Tensor, matches: PointMatches, spans: Tensor | None = None) -> Tensor:
+def steady_fit(motions: Tensor, matches: PointMatches) -> Tensor:
     """The steady motion that explains most of the matches, from where this one leads to.
 
     Minimises what matches cost (`disagreement`, a Cauchy kernel) and what changes from one motion
-    to the next do, of the rotation and of the translation as a share of its usual length, each per
-    time and over the root of the time from the middle of one to that of the next. Each motion stays
-    as long as it was in the end: so few matches do not know better.
+    to the next do, of the rotation and of the translation as a share of its usual length. Each
+    motion stays as long as it was in the end: so few matches do not know better.
 
     Args:
         motions: [N-1,7] from each of N >= 3 keyframes to the next. matches: between them.
-        spans: [N-1] float64, the time that each of them takes, above 0, in any unit; None: all
-            take the same.
     Returns:
         [N-1,7] float64, such motions.
     """
-    if spans is None:
-        spans = motions.new_ones(len(motions), dtype=torch.float64)
-    spans = spans / spans.mean()
     known = motions[:, :3].double().norm(dim=1, keepdim=True)
     motions = _as_long(motions.double())
-    energy, damped = _energy(motions, matches, spans), _DAMPED
+    energy, damped = _energy(motions, matches), _DAMPED
     for _ in range(_STEPS):
-        H, g = _normal_equations(motions, matches, spans)
+        H, g = _normal_equations(motions, matches)
         before = energy
         while damped < _STUCK:
             diagonal = torch.diag(damped * (H.diagonal() + 1e-6))
             step = -torch.linalg.solve(H + diagonal, g).reshape(-1, 6)
             tried = _as_long(mul(exp(step), motions))
-            energy = _energy(tried, matches, spans)
+            energy = _energy(tried, matches)
             if energy < before:
                 motions, damped = tried, max(damped / 5, _LEAST)
                 break
@@ -205,27 +199,21 @@ def led(motions: Tensor) -> Tensor:
     return chained(motions, identity(dtype=motions.dtype))
 
 
-def _energy(motions: Tensor, matches: PointMatches, spans: Tensor) -> float:
-    changes = _changes(motions, spans)
+def _energy(motions: Tensor, matches: PointMatches) -> float:
+    changes = _changes(motions)
     return float(disagreement(led(motions), matches).sum() + changes.square().sum())
 
 
-def _changes(motions: Tensor, spans: Tensor) -> Tensor:
+def _changes(motions: Tensor) -> Tensor:
     """What changes from one motion to the next, weighed, [N-2,6]; translations first."""
-    still = torch.zeros_like(motions[:, :3])
-    turns = log(torch.cat([still, motions[:, 3:]], dim=1))[:, 3:]
-    speeds = torch.cat([motions[:, :3] / _SHARE, turns / _TURN], dim=1) / spans[:, None]
-    return (speeds[1:] - speeds[:-1]) / _apart(spans)[:, None]
+    t, R = motions[:, :3], motions[:, 3:]
+    still = torch.zeros_like(t)
+    turns = torch.cat([still, R], dim=1)
+    turned = log(mul(turns[1:], inv(turns[:-1])))[:, 3:]
+    return torch.cat([(t[1:] - t[:-1]) / _SHARE, turned / _TURN], dim=1)
 
 
-def _apart(spans: Tensor) -> Tensor:
-    """Root of the time from the middle of one motion to that of the next, [N-2]."""
-    return (0.5 * (spans[1:] + spans[:-1])).sqrt()
-
-
-def _normal_equations(
-    motions: Tensor, matches: PointMatches, spans: Tensor
-) -> tuple[Tensor, Tensor]:
+def _normal_equations(motions: Tensor, matches: PointMatches) -> tuple[Tensor, Tensor]:
     """Of tangent vectors of all motions, [6(N-1),6(N-1)] and [6(N-1)], Gauss-Newton."""
     count, poses = len(motions), led(motions)
     _, r, J = _judged(poses, matches)
@@ -242,18 +230,16 @@ def _normal_equations(
     H = torch.einsum("pkab,pac,plcd->kbld", seen, H_pair, seen).reshape(6 * count, 6 * count)
     g = torch.einsum("pkab,pa->kb", seen, g_pair).reshape(-1)
 
-    # Rotations are small: the Jacobian of a rotation vector is the identity.
-    e, t = _changes(motions, spans), motions[:, :3]
+    # The rotation from one motion to the next is small: its Jacobians are those of a difference.
+    e, t = _changes(motions), motions[:, :3]
     moved = torch.zeros(count, 6, 6, dtype=r.dtype)
     moved[:, :3, :3] = torch.eye(3, dtype=r.dtype) / _SHARE
     moved[:, :3, 3:] = -skew(t) / _SHARE
     moved[:, 3:, 3:] = torch.eye(3, dtype=r.dtype) / _TURN
-    moved /= spans[:, None, None]
-    root = _apart(spans)[:, None, None]
     steady = torch.zeros(count - 1, 6, count, 6, dtype=r.dtype)
     at = torch.arange(count - 1)
-    steady[at, :, at] = -moved[:-1] / root
-    steady[at, :, at + 1] = moved[1:] / root
+    steady[at, :, at] = -moved[:-1]
+    steady[at, :, at + 1] = moved[1:]
     steady = steady.reshape(6 * (count - 1), 6 * count)
     return H + steady.T @ steady, g + steady.T @ e.reshape(-1)
 

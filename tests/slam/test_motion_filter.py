@@ -97,30 +97,3 @@ def test_what_is_set_aside_of_a_keyframe_holds_until_the_next():
     judge.set_aside(frames[0], "cells")
     assert [judge.judge(frame).keep for frame in frames[1:]] == [False, True, False]
     assert table.asked == [(0, "cells"), (0, "cells"), 2]
-
-
-@pytest.mark.parametrize(
-    ("matched", "flow", "keep"),
-    [
-        (0.9, 1.2, False),
-        (0.9, 1.3, True),
-        (0.4, 1.2, False),
-        (0.2, 0.6, False),  # half of the least share: half of the threshold
-        (0.2, 0.7, True),
-        (0.02, 9.0, False),  # a picture that has nothing to do with the last one
-    ],
-)
-def test_where_little_is_matched_keyframes_are_nearer(matched, flow, keep):
-    class Fixed:
-        def motion(self, reference, current):
-            return Motion(flow, matched)
-
-    options = MotionFilterConfig(threshold=1.25, min_matched=0.4, lost_below=0.03)
-    judge, blank = MotionFilter(Fixed(), options), torch.zeros(0)
-    judge.judge(Encoded(Frame(0, 0.0, blank, blank), 0))
-    assert judge.judge(Encoded(Frame(1, 0.1, blank, blank), 1)).keep is keep
-    options.min_matched = 0.0
-    judge = MotionFilter(Fixed(), options)
-    judge.judge(Encoded(Frame(0, 0.0, blank, blank), 0))
-    found = judge.judge(Encoded(Frame(1, 0.1, blank, blank), 1)).keep
-    assert found is (flow > 1.25 and matched > 0.03)

@@ -103,8 +103,7 @@ def turns_off(T_cw, truth):
 
 def look(made):
     matches, gates = matched_points(made), made.gates()
-    times = torch.arange(len(made.store), dtype=torch.float64)
-    return contradicted(Path.of(made.store), matches, made.store.intrinsics, gates, times)
+    return contradicted(Path.of(made.store), matches, made.store.intrinsics, gates)
 
 
 def test_points_are_rays_of_keyframes_that_are_near(optimiser, truth):

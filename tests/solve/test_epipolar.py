@@ -111,8 +111,7 @@ def test_derivatives_are_those_of_autograd():
     assert torch.allclose(J, full[row, row], rtol=1e-9, atol=1e-9 * float(J.abs().max()))
 
 
-@pytest.mark.parametrize("even", [True, False])
-def test_normal_equations_are_those_of_autograd(even):
+def test_normal_equations_are_those_of_autograd():
     """The gradient of the energy, whose kernel is that of the weights."""
     from droidw.solve import epipolar
 
@@ -121,20 +120,17 @@ def test_normal_equations_are_those_of_autograd(even):
     g = torch.Generator().manual_seed(2)
     shaken = 0.01 * torch.randn(len(motions), 6, generator=g, dtype=torch.float64)
     motions = se3.mul(se3.exp(shaken), motions)
-    spans = torch.ones(len(motions), dtype=torch.float64)
-    if not even:
-        spans[1::2] = 0.5
-    _, gradient = epipolar._normal_equations(motions, found, spans)
+    _, gradient = epipolar._normal_equations(motions, found)
 
     def energy(xi):
         moved = se3.mul(se3.exp(xi), motions)
         T = led(moved)
-        change = epipolar._changes(moved, spans)
+        change = epipolar._changes(moved)
         return disagreement(T, found).sum() + change.square().sum()
 
     zero = torch.zeros(len(motions), 6, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(energy(zero), zero)
-    # Rotation vectors count as differences: right to the square of a rotation.
+    # The rotation from one motion to the next counts as a difference: right to its square.
     assert torch.allclose(
         2 * gradient.reshape(-1, 6), slope, rtol=2e-2, atol=2e-2 * slope.abs().max()
     )
@@ -305,22 +301,6 @@ def test_few_points_tell_a_steady_motion_from_its_twin(wrong):
     stayed = steady_fit(between(twin), found)
     cost = disagreement(led(motions), found).sum()
     assert cost < 0.75 * disagreement(led(stayed), found).sum()
-
-
-def test_what_is_steady_is_so_per_time():
-    """A camera that goes on and turns as ever; keyframes are one and two pictures apart."""
-    from droidw.solve import epipolar
-
-    speed = torch.tensor([0.1, 0.0, -0.1, 0.0, 0.004, 0.002], dtype=torch.float64)
-    spans = torch.tensor([2.0, 1.0, 1.0, 2.0, 1.0], dtype=torch.float64)
-    motions = se3.exp(speed * spans[:, None])
-    unsteady = epipolar._changes(motions, torch.ones_like(spans)).norm()
-    assert epipolar._changes(motions, spans).norm() < 0.02 * unsteady
-    # A change in half of the time is as unusual as one that is larger by root 2.
-    other = torch.tensor([1.0, 1.0, 2.0, 2.0], dtype=torch.float64)
-    sudden = speed * torch.tensor([1.0, 1.1, 1.1, 1.0])[:, None] * other[:, None]
-    change = epipolar._changes(se3.exp(sudden), other)[[0, 2]].norm(dim=1)
-    assert torch.allclose(change[0] / change[1], torch.tensor(2.0).double().sqrt(), rtol=0.02)
 
 
 def test_a_steady_motion_leaves_what_is_wrong_without_a_wall():
