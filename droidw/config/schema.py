@@ -89,7 +89,7 @@ class MotionFilterConfig:
     )
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
-        0.3,
+        0.4,
         "a frame in which less than this share of the cells is matched is taken at once",
         ge=0,
         le=1,
