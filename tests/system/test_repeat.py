@@ -56,9 +56,9 @@ def test_frames_that_do_not_fit_in_memory_are_read_again(go, footage):
 def system(quick, rendered):
     """Build a system and the frames for it, from Python."""
 
-    def make(threaded=False):
+    def make(threaded=False, more=()):
         plugins = droidw.load_plugins(environ={})
-        config = load_config([], "cpu", list(quick[2:]))
+        config = load_config([], "cpu", [*quick[2:], *more])
         resolved = resolve(config, plugins)
         context = BuildContext(torch.device("cpu"), run_dir=Path("/nonexistent"))
 
@@ -98,3 +98,30 @@ def test_frame_by_frame_equals_all_at_once(system):
         assert np.array_equal(first.trajectory.times, other.trajectory.times)
         assert np.array_equal(first.cloud.xyz, other.cloud.xyz)
         assert [k.index for k in first.keyframes] == [k.index for k in other.keyframes]
+
+
+LEARNED = ("features=cnn", "uncertainty=affine-softplus", "uncertainty.options.movable_gain=8")
+
+
+@pytest.mark.parametrize("threaded", [False, True])
+@pytest.mark.parametrize(("keep", "above"), [(0.9, 0.0), (0.0, 0.1), (0.9, 0.1), (0.0, 0.0)])
+def test_what_can_move_is_asked_of_the_keyframes_that_need_it(system, keep, above, threaded):
+    """Of all where the model renews its start or motion is told without it, else of the first."""
+    settings = (f"uncertainty.options.movable_keep={keep}", f"motion_filter.movable_above={above}")
+    slam, frames = system(threaded, (*LEARNED, *settings))
+    features, model, op = slam.parts.features, slam.parts.uncertainty, slam.parts.correspondence
+    asked, renewed, aside = [], [], []
+    movable, renew, set_aside = features.movable, model.renew, op.aside
+    features.movable = lambda *given: asked.append(movable(*given)) or asked[-1]
+    model.renew = lambda view, k, found: renewed.append((k, found)) or renew(view, k, found)
+    op.aside = lambda payload, cells: aside.append(cells) or set_aside(payload, cells)
+    slam.track(iter(frames))
+    count = len(slam.store)
+    assert slam.frontend.initialised and count > 4
+    assert len(aside) == (len(asked) if above else 0)
+    assert len(asked) >= count if keep or above else len(asked) == 4
+    assert bool(renewed) is (keep > 0)
+    for number, found in renewed:
+        assert number >= 4 and any(found is one for one in asked)
+    for cells, one in zip(aside, asked, strict=False):
+        assert torch.equal(cells, one > above)
