@@ -28,12 +28,14 @@ class CellMaps:
         picked: the same, where features and depth are to be taken.
         device: where the maps are wanted.
         clock: where the time of each part is added up.
+    Attributes:
+        parts: those that are asked.
     """
 
     def __init__(
         self, parts: Parts, grid: Grid, picked: Grid, device: torch.device, clock: Stopwatch
     ) -> None:
-        self._parts = parts
+        self.parts = parts
         self._grid = grid
         self._picked = picked
         self._device = device
@@ -42,20 +44,20 @@ class CellMaps:
     def features(self, frame: Frame) -> Tensor:
         """[C,h,w] of the extractor."""
         with self._clock("features"):
-            return self._parts.features.extract(upload(frame.image, self._device), self._picked)
+            return self.parts.features.extract(upload(frame.image, self._device), self._picked)
 
     def movable(self, frame: Frame) -> Tensor:
         """[h,w] in [0,1], how much speaks for what can move; of an extractor that has `movable`."""
         with self._clock("features"):
             image = upload(frame.image, self._device)
-            found: Tensor = self._parts.features.movable(image, self._picked)  # type: ignore[attr-defined]
+            found: Tensor = self.parts.features.movable(image, self._picked)  # type: ignore[attr-defined]
             return found
 
     def prior(self, frame: Frame) -> Tensor:
         """[h,w] inverse depth, 0 where it is not known."""
         with self._clock("depth prior"):
             blank = torch.zeros(self._grid.height, self._grid.width, device=self._device)
-            prediction = self._parts.depth.predict(frame)
+            prediction = self.parts.depth.predict(frame)
             if prediction is None:
                 return blank
             depth = self._picked.sample(upload(prediction.depth, self._device), mode="nearest")

@@ -6,6 +6,8 @@ test_update.py.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -113,9 +115,7 @@ def test_where_depth_is_taken_from(system_of, compat, pixel):
             grids.append(grid)
             return image.new_zeros(0, grid.height, grid.width)
 
-    system.parts = type(system.parts)(
-        Notes(), Ramp(), system.parts.uncertainty, system.parts.ba, system.parts.correspondence
-    )
+    system._maps.parts = replace(system.parts, features=Notes(), depth=Ramp())
     system.push(frames[0])
     expected = 1 / (torch.arange(12.0) * 8 + 1 + pixel)
     assert torch.allclose(system.store["prior"][0], expected.expand(8, 12))
