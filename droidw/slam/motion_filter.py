@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from droidw.interfaces.correspondence import Motion
@@ -81,9 +81,7 @@ class MotionFilter:
     ) -> None:
         self._correspondence = correspondence
         self._options = options
-        # The last candidate, and its payload as motion is measured from it.
         self._reference: Encoded | None = None
-        self._from: Any = None
         # Frames are counted from here; and the candidate of which the window has yet to decide.
         self._last_index = 0
         self._open: int | None = None
@@ -96,7 +94,7 @@ class MotionFilter:
         if self._reference is None:
             self._accept(current, forced=True)
             return Verdict(keep=True, forced=False, motion=None)
-        motion = self._correspondence.motion(self._from, current.payload)
+        motion = self._correspondence.motion(self._reference.payload, current.payload)
         options = self._options
         forced = options.force_every > 0 and self._gap(current.frame.index) >= options.force_every
         keep = motion.flow > options.threshold
@@ -117,7 +115,8 @@ class MotionFilter:
 
         Only of a correspondence that has `aside`.
         """
-        self._from = self._correspondence.aside(current.payload, cells)  # type: ignore[attr-defined]
+        payload = self._correspondence.aside(current.payload, cells)  # type: ignore[attr-defined]
+        self._reference = replace(current, payload=payload)
 
     def settled(self, index: int, kept: bool) -> None:
         """Whether candidate `index` has become a keyframe for good: frames are counted from it."""
@@ -147,7 +146,6 @@ class MotionFilter:
 
     def _accept(self, current: Encoded, forced: bool) -> None:
         self._reference = current
-        self._from = current.payload
         self._lost = 0
         with self._window:
             if forced:  # the window may not drop it
