@@ -305,6 +305,26 @@ class WeightingConfig:
 
 
 @dataclass
+class LinesConfig:
+    """Lines along three directions at right angles, which tell how the camera is turned."""
+
+    weight: float = opt(
+        30.0,
+        "how much they count: a line whose end is a fifth of a pixel off the direction that its "
+        "keyframe's pose gives it as much as so many matches with a usual residual, of a "
+        "correspondence that finds lines (0: not at all)",
+        ge=0,
+    )
+    least_share: float = opt(
+        0.75,
+        "share of the length of all lines that must be along such directions, in half of the first "
+        "keyframes and later of all, for them to count",
+        ge=0,
+        le=1,
+    )
+
+
+@dataclass
 class CloudConfig:
     """Which depths count as seen consistently, and go into the static cloud."""
 
@@ -343,6 +363,7 @@ class DroidwConfig:
     backend: BackendConfig = field(default_factory=BackendConfig)
     filler: FillerConfig = field(default_factory=FillerConfig)
     weighting: WeightingConfig = field(default_factory=WeightingConfig)
+    lines: LinesConfig = field(default_factory=LinesConfig)
     cloud: CloudConfig = field(default_factory=CloudConfig)
     schedule: dict[str, PhaseConfig] = field(
         default_factory=lambda: {

@@ -28,6 +28,7 @@ class KeyframeInfo:
         image: [H,W,3] uint8 RGB at working size.
         payload: what the correspondence op keeps; opaque.
         disp_full: [H,W] float32, or None where correspondence does not enlarge maps itself.
+        lines: [n,4] float32 ends x, y, x, y of lines in the picture, pixels; None: not asked.
         whole: payload and field `unmasked` [h,w] of the whole picture, where something of it is
             hidden while it is tracked; else None.
     """
@@ -38,6 +39,7 @@ class KeyframeInfo:
     image: npt.NDArray[np.uint8]
     payload: Any
     disp_full: npt.NDArray[np.float32] | None = None
+    lines: npt.NDArray[np.float32] | None = None
     whole: tuple[Any, Tensor] | None = None
 
 
@@ -48,7 +50,9 @@ class KeyframeStore:
         T_cw [7] world to camera; disps [h,w] inverse depth; prior [h,w] inverse depth of the
         depth prior (0: none); features [c,h,w]; uncertainty [h,w]; damping [h,w] learned;
         unmasked [h,w] in [0,1], what the user's mask leaves of a cell and its neighbours; movable
-        [h,w] in [0,1], how likely features find what can move by itself (0: not asked).
+        [h,w] in [0,1], how likely features find what can move by itself (0: not asked); axes [3,3]
+        rotation from the axes of the scene to the camera, by the lines in the picture, and
+        axes_information [3,3] of a tangent vector on the left of it (0: not known), float64.
 
     Args:
         grid: the grid on which maps live.
@@ -82,6 +86,8 @@ class KeyframeStore:
             StoreField("damping", ("h", "w"), fill=1e-6),
             StoreField("unmasked", ("h", "w"), fill=1.0),
             StoreField("movable", ("h", "w")),
+            StoreField("axes", (3, 3), dtype="float64"),
+            StoreField("axes_information", (3, 3), dtype="float64"),
         )
         self._declared: dict[str, StoreField] = {}
         sizes = {"h": grid.height, "w": grid.width, "c": feature_dim}

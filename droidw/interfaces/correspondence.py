@@ -120,6 +120,11 @@ class Correspondence(Protocol):
     by itself is set aside so. `matched` is then the share of the picture that the other cells of it
     have, as under the user's mask, unless hardly any are left.
 
+    And it may have `line_segments(payload) -> [n,4]`: ends x, y, x, y of straight edges in the
+    picture, pixels of the working size. Where most of them are along three directions at right
+    angles they tell how the camera is turned (`lines.weight`), for which an end should be right to
+    a fifth of a pixel.
+
     Attributes:
         stride, offset: the grid: cell (x, y) lies at pixel `stride * (x, y) + offset`.
     """

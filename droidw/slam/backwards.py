@@ -323,7 +323,9 @@ def track_backwards(
             values = known.values(node)
             if done >= first:
                 values["T_cw"], values["disps"] = frontend.guess(info.time)
-            store.append(info, **values)
+            number = store.append(info, **values)
+            if done >= first:
+                frontend.optimiser.upright.turn(number)
             if done == first - 1:
                 frontend.resume()
             elif done >= first:

@@ -78,6 +78,7 @@ class Frontend:
         schedule, options = self.config.schedule, self.options
         self.graph.add(neighbour_edges(count, 3))
         self.optimiser.begin()
+        self.optimiser.upright.begin()
         self._solver = self._first_solver()
         self._updates("init_blind", first_free=1, informed=False)
         if options.starts:
@@ -131,6 +132,8 @@ class Frontend:
         better = False
         for start in plane_starts(store.disps):
             store.write(*start)
+            for number in range(1, len(store)):
+                self.optimiser.upright.turn(number, still=True)
             self.optimiser.adjust(self.graph, rows, phase, self._solver, first_free=1)
             found = self._settled_cost(weigh=True)
             if found < cost:
@@ -202,6 +205,7 @@ class Frontend:
             iterations=_MATCH_STEPS,
             solver=self.config.filler_solver,
             label="match",
+            known=lambda T_cw, usual: self.optimiser.upright.term(T_cw, last, usual),
         )
         store.T_cw[last:] = found
         store.disps[last] = carry_depth(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -11,13 +12,14 @@ from torch import Tensor
 from droidw.geometry.projective import depth_there, reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
-from droidw.solve.kernel import redescended
+from droidw.solve.kernel import redescended, usual_square
 from droidw.solve.problem import BAProblem
 from droidw.solve.weights import residual_weights
 
 if TYPE_CHECKING:
     from droidw.config.schema import SolverConfig
     from droidw.slam.optimise import Optimiser
+    from droidw.solve.problem import PoseTerm
 
 __all__ = ["carry_depth", "locate"]
 
@@ -33,6 +35,7 @@ def locate(
     iterations: int,
     solver: SolverConfig,
     label: str = "fill",
+    known: Callable[[Tensor, float], PoseTerm | None] | None = None,
 ) -> Tensor:
     """Refine the poses of F frames against keyframes that see the same.
 
@@ -43,6 +46,7 @@ def locate(
         gates: [N,h,w] weights in [0,1] of all keyframes.
         updates, iterations: correspondence updates, and Gauss-Newton steps after each.
         label: under which the time is counted.
+        known: poses [F,7] and the square of a usual residual -> what is known of the poses besides.
     Returns:
         [F,7]; the start where bundle adjustment could not move a frame.
     """
@@ -99,6 +103,9 @@ def locate(
                     pairs=pairs,
                 )
                 # each frame has a kernel of its own width
+                said = None if known is None else known(T_cw[len(used) :], usual_square(problem))
+                if said is not None:
+                    problem = replace(problem, pose_term=said.after(len(used)))
                 problem = redescended(problem, solver, jj - len(used), len(payloads))
                 T_cw = optimiser.parts.ba.step(problem).T_cw
     return T_cw[len(used) :]

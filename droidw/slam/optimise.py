@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,6 +16,7 @@ from droidw.geometry.projective import reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.interfaces.uncertainty import Indices, UncertaintyView
+from droidw.slam.upright import Upright
 from droidw.solve.epipolar import PointMatches, epipolar_term
 from droidw.solve.kernel import redescended, usual_square
 from droidw.solve.motion import steady_motion
@@ -21,7 +24,7 @@ from droidw.solve.problem import BAProblem, PoseTerm, Report
 from droidw.solve.weights import gate, opened, residual_weights
 
 if TYPE_CHECKING:
-    from droidw.config.schema import PhaseConfig, SolverConfig, WeightingConfig
+    from droidw.config.schema import LinesConfig, PhaseConfig, SolverConfig, WeightingConfig
     from droidw.graph.factors import FactorGraph
     from droidw.graph.store import KeyframeStore
     from droidw.interfaces.bundle import BundleAdjuster
@@ -66,12 +69,14 @@ class Optimiser:
         weighting: how confidence and uncertainty become weights.
         clock: where the time of each part is added up.
         published: similarities are the raw cosine, whatever `weighting` says.
+        lines: how much lines in the pictures count; None: not at all.
     Attributes:
         begins: uncertainty is to be told what can move before the first search. begun: it was.
         doubtful: correspondence is asked on behalf of a path that is in doubt.
         points: matched between keyframes of the store, and how much they count in steps that all
             keyframes have a part in: a fifth of a pixel off its epipolar line, a point counts as
             much as so many matches with a usual residual. None: not at all.
+        upright: how the keyframes of the store are turned by the lines that they see.
     """
 
     def __init__(
@@ -81,11 +86,14 @@ class Optimiser:
         weighting: WeightingConfig,
         clock: Stopwatch,
         published: bool = False,
+        lines: LinesConfig | None = None,
     ) -> None:
         self.store = store
         self.parts = parts
         self.weighting = weighting
         self.clock = clock
+        self._lines = lines
+        self.upright = Upright(store, parts.correspondence, lines, self.gates, clock)
         self._published = published
         self._calibrate = (
             weighting.similarity == "matched"
@@ -104,7 +112,10 @@ class Optimiser:
 
     def beside(self, store: KeyframeStore) -> Optimiser:
         """The same for another store, whose uncertainty begins with what this one has learned."""
-        other = Optimiser(store, self.parts, self.weighting, self.clock, self._published)
+        other = Optimiser(
+            store, self.parts, self.weighting, self.clock, self._published, self._lines
+        )
+        other.upright.like(self.upright)
         other.begun = self.begun
         other.doubtful = self.doubtful
         return other
@@ -271,17 +282,17 @@ class Optimiser:
     def _known(self, problem: BAProblem, low: int, motion_prior: float) -> PoseTerm | None:
         """What is known of the poses from `low` on besides matches."""
         points = self.points if low == 0 else None
-        if motion_prior <= 0 and points is None:
+        if motion_prior <= 0 and points is None and not self.upright.holds:
             return None
         usual = usual_square(problem)
-        known = None
+        said = [self.upright.term(problem.T_cw, low, usual)]
         if motion_prior > 0:
             times = torch.tensor(self.store.times()[low:], dtype=torch.float64)
-            known = steady_motion(problem.T_cw, times, motion_prior * usual)
+            said.append(steady_motion(problem.T_cw, times, motion_prior * usual))
         if points is not None:
-            said = epipolar_term(problem.T_cw, points[0], points[1] * usual)
-            known = said if known is None else known + said
-        return known
+            said.append(epipolar_term(problem.T_cw, points[0], points[1] * usual))
+        terms = [term for term in said if term is not None]
+        return reduce(operator.add, terms) if terms else None
 
     def _note(self, report: Report) -> None:
         if report.status != "ok":

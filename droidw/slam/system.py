@@ -107,7 +107,12 @@ class SlamSystem:
             getattr(parts.features, "dtype", torch.float32),
         )
         self.optimiser = Optimiser(
-            self.store, parts, config.weighting, self.clock, "droid-w" in config.compat
+            self.store,
+            parts,
+            config.weighting,
+            self.clock,
+            "droid-w" in config.compat,
+            config.lines,
         )
         self.frontend = Frontend(self.optimiser, config)
         self._pool = ThreadPoolExecutor(1, "ahead") if threaded else None
@@ -193,13 +198,8 @@ class SlamSystem:
 
     def _push(self, current: Encoded, verdict: Verdict) -> bool:
         frame = current.frame
-        made = (
-            current.payload,
-            current.context,
-            current.features,
-            current.prior,
-            current.movable,
-        )
+        maps = current.features, current.prior, current.movable
+        made = (current.payload, current.context, *maps)
         plain = current.plain
         whole = None if plain is None else (plain.payload, plain.context)
         self._ahead.take(current.ready, made, whole)
@@ -264,6 +264,7 @@ class SlamSystem:
             if self._renews and self.optimiser.begun:
                 parts.uncertainty.renew(view, number, movable)  # type: ignore[attr-defined]
             parts.uncertainty.append(view, number)
+        self.optimiser.upright.see(number)
         return number
 
     # -- finishing -------------------------------------------------------------------------
@@ -287,6 +288,7 @@ class SlamSystem:
             self._hold_still()
         elif not brief:
             with self.clock("global"):
+                self.optimiser.upright.again()
                 backend = Backend(self.optimiser, self.config, self._focal_known)
                 backend.run(lambda done, total: self.events.emit(Progress("global", done, total)))
                 self._refined(backend.focal)
@@ -328,6 +330,7 @@ class SlamSystem:
         if focal is not None and focal.factor != 1.0:
             fx, fy = self.camera.fx * focal.factor, self.camera.fy * focal.factor
             self.camera = replace(self.camera, fx=fx, fy=fy)
+            self.optimiser.upright.again()
 
     def _hold_still(self) -> None:
         """A camera at rest: every pose is the first, and no depth can be known."""

@@ -48,6 +48,13 @@ class PoseTerm:
         """The same on a device, in float64."""
         return PoseTerm(self.band.to(device, torch.float64), self.rhs.to(device, torch.float64))
 
+    def after(self, count: int) -> PoseTerm:
+        """The same with so many poses before these of which nothing is known."""
+        band = self.band.new_zeros(count, *self.band.shape[1:])
+        return PoseTerm(
+            torch.cat([band, self.band]), torch.cat([self.rhs.new_zeros(count, 6), self.rhs])
+        )
+
     def __add__(self, other: PoseTerm) -> PoseTerm:
         """Both, on the device of this one."""
         other = other.to(self.rhs.device)

@@ -72,6 +72,7 @@ def correspondence(subject: Subject) -> None:
         _motion(subject, part, payloads)
         _aside(subject, part, payloads, grid)
         _points(subject, part, payloads, grid, (rows, columns))
+        _lines(subject, part, payloads, (rows, columns))
 
 
 def _refuses(part: Any, frame: Frame, grid: Grid) -> bool:
@@ -299,4 +300,25 @@ def _points(
         "matched_points",
         unseen.shape == (0, 4),
         f"{len(unseen)} points are matched in a picture whose cells are all closed",
+    )
+
+
+def _lines(subject: Subject, part: Any, payloads: list[Any], size: tuple[int, int]) -> None:
+    """Straight edges of a picture, where the part finds them."""
+    find = getattr(part, "line_segments", None)
+    if find is None:
+        return
+    with subject.calling("line_segments"):
+        found, again = (np.asarray(find(payloads[0])) for _ in range(2))
+    within = np.array([size[1], size[0], size[1], size[0]])
+    subject.expect(
+        "line_segments",
+        found.ndim == 2 and found.shape[1] == 4 and bool(((found > -1) & (found < within)).all()),
+        f"lines in a picture of {size[1]}x{size[0]} are {found!r}; due are rows of x, y of one end "
+        "and x, y of the other, in pixels of the picture",
+    )
+    subject.expect(
+        "line_segments",
+        np.array_equal(found, again),
+        "lines of one picture differ when asked again",
     )

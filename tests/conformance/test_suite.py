@@ -394,6 +394,26 @@ def test_points_lie_in_the_pictures_and_not_where_these_are_closed():
     broken("matched_points", "correspondence", component(lambda: seen([[5, 6, 7, 8]])))
 
 
+class Lined(Wrapped):
+    """Finds the same lines in every picture, or others every time."""
+
+    def __init__(self, lines, drift=0.0):
+        super().__init__(lambda request, update: update)
+        self.lines, self.drift = np.array(lines, np.float32), drift
+
+    def line_segments(self, payload):
+        self.lines = self.lines + self.drift
+        return self.lines
+
+
+def test_lines_lie_in_the_picture_and_stay():
+    conformance.check("correspondence", component(lambda: Lined([[5, 6, 17, 18]])))
+    conformance.check("correspondence", component(lambda: Lined(np.zeros((0, 4)))))
+    broken("line_segments", "correspondence", component(lambda: Lined([[5, 6, 999, 8]])))
+    broken("line_segments", "correspondence", component(lambda: Lined([[5, 6]])))
+    broken("line_segments", "correspondence", component(lambda: Lined([[5, 6, 17, 18]], 0.5)))
+
+
 SMALL = READER.options(frames=6, width=64, height=48)
 SHARED = Scene(named_spec("handheld", frames=6, width=64, height=48))
 

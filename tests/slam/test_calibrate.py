@@ -34,7 +34,8 @@ class Store(dict):
     ],
 )
 def test_calibration_is_asked_for_where_it_is_needed(similarity, extractor, published, asked):
-    parts = SimpleNamespace(features=SimpleNamespace(dim=3, **extractor), uncertainty=None)
+    features = SimpleNamespace(dim=3, **extractor)
+    parts = SimpleNamespace(features=features, uncertainty=None, correspondence=None)
     store = Store(features=torch.zeros(0, 3, 3, 4), uncertainty=torch.zeros(0, 3, 4))
     weighting = WeightingConfig(similarity=similarity)
     view = Optimiser(store, parts, weighting, Stopwatch(), published).view()

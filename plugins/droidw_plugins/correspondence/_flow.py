@@ -23,6 +23,7 @@ from droidw_plugins.correspondence._flow_information import (
     trust,
     turned,
 )
+from droidw_plugins.correspondence._flow_lines import line_segments
 from droidw_plugins.correspondence._flow_mask import (
     grown,
     rounded,
@@ -157,6 +158,10 @@ class FlowCorrespondence:
         below = self.options.bridge or _CLOSED
         seeds = self._seeds.between(a, b, gate_a < below, gate_b < below)
         return np.concatenate([seeds.here, seeds.there], axis=1)[seeds.held]
+
+    def line_segments(self, payload: FlowFrame) -> Array:
+        """Straight edges of the picture, [n,4] ends x, y, x, y in pixels."""
+        return line_segments(payload.grey if payload.unsoftened is None else payload.unsoftened)
 
     # -- measuring -------------------------------------------------------------------------
 

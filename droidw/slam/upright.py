@@ -1,0 +1,193 @@
+"""Keyframes turned as the lines they see say."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from droidw.geometry.se3 import from_matrix, inv, rotation
+from droidw.geometry.transfer import upload
+from droidw.solve.manhattan import Axes, LineRays, axes_in_turn, next_axes, rotation_term
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from droidw.config.schema import LinesConfig
+    from droidw.graph.store import KeyframeStore
+    from droidw.interfaces.correspondence import Correspondence
+    from droidw.slam.timing import Stopwatch
+    from droidw.solve.problem import PoseTerm
+
+__all__ = ["Upright"]
+
+_log = logging.getLogger(__name__)
+
+# Share of the length of lines that must agree with the axes of a picture, for these to count.
+_KNOWN = 0.6
+
+
+class Upright:
+    """Measures the axes of keyframes in the store, and holds poses to them.
+
+    Whether a scene has lines along three directions at right angles is decided when tracking
+    begins, by the first keyframes: half of them must have `least_share` of the length of their
+    lines along these. Where it has not, nothing here does anything.
+
+    Args:
+        store: has the fields `axes` and `axes_information`.
+        correspondence: only one that has `line_segments` is asked.
+        options: how much lines count, and where; None: nowhere.
+        gates: number of the first keyframe -> [n,h,w] in [0,1], what of each is open.
+        clock: where the time is added up.
+    Attributes:
+        holds: whether lines count. None before that is decided.
+    """
+
+    def __init__(
+        self,
+        store: KeyframeStore,
+        correspondence: Correspondence,
+        options: LinesConfig | None,
+        gates: Callable[[int], Tensor],
+        clock: Stopwatch,
+    ) -> None:
+        self._store = store
+        self._find = getattr(correspondence, "line_segments", None)
+        self._weight = 0.0 if options is None else options.weight
+        self._least_share = 0.0 if options is None else options.least_share
+        self._gates = gates
+        self._clock = clock
+        asked = self._find is not None and self._weight > 0
+        self.holds: bool | None = None if asked else False
+
+    def see(self, number: int) -> None:
+        """Find the lines of a keyframe just appended, and turn it as they say."""
+        if self.holds is False or self._find is None:
+            return
+        store = self._store
+        with self._clock("lines"):
+            store.infos[number].lines = np.asarray(self._find(store.payload(number)), np.float32)
+            if self.holds is None:
+                return
+            near = [self._expected(number).cpu().numpy()]
+            known = self._known()
+            near += [store["axes"][known[-1]].cpu().numpy()] if known else []
+            self._keep(number, next_axes(self._rays(number, self._gates(number)[0]), near))
+            self.turn(number)
+
+    def begin(self) -> None:
+        """Decide by the keyframes so far whether lines count; if so, turn these."""
+        if self.holds is None:
+            self.holds = True
+            share = self.again()
+            if self.holds:
+                _log.info(
+                    "%.0f %% of the length of lines is along three directions at right angles: "
+                    "they tell how the camera is turned (lines.weight=0 does not ask them)",
+                    100 * share,
+                )
+                for number in range(len(self._store)):
+                    self.turn(number, still=True)
+
+    def again(self) -> float:
+        """Measure the axes of all keyframes, by the gates and the focal length of now.
+
+        Returns:
+            The share of the length of lines that agrees with them, of half of the keyframes.
+        """
+        if not self.holds:
+            return 0.0
+        with self._clock("lines"):
+            gates = self._gates(0)
+            count = len(self._store)
+            found = axes_in_turn([self._rays(k, gates[k]) for k in range(count)])
+            for number, axes in enumerate(found):
+                self._keep(number, axes)
+        shares = [0.0 if axes is None else axes.share for axes in found]
+        share = float(np.median(shares)) if shares else 0.0
+        self.holds = share >= self._least_share
+        return share
+
+    def like(self, other: Upright) -> None:
+        """Let lines count as for another store, of the same keyframes."""
+        self.holds = other.holds
+
+    def turn(self, number: int, still: bool = False) -> None:
+        """Turn a keyframe about its centre as its lines say, where they do.
+
+        Args:
+            still: it keeps its translation instead of its centre.
+        """
+        store = self._store
+        if not self.holds or not bool(store["axes_information"][number].any()):
+            return
+        pose = store.T_cw[number].double()
+        turned = torch.zeros(3, 4, dtype=pose.dtype, device=pose.device)
+        turned[:, :3] = store["axes"][number] @ self._world().mT
+        centre = inv(pose)[:3]
+        turned[:, 3] = pose[:3] if still else -turned[:, :3] @ centre
+        store.T_cw[number] = from_matrix(turned).to(store.T_cw)
+
+    def term(self, T_cw: Tensor, first: int, usual: float) -> PoseTerm | None:
+        """What lines say of the poses [N,7] of the keyframes from `first` on.
+
+        Args:
+            usual: square of a usual residual, the unit in which they count.
+        """
+        store = self._store
+        if not self.holds or not self._known():
+            return None
+        information = store["axes_information"][first:]
+        weight = self._weight * usual
+        return rotation_term(T_cw, store["axes"][first:], information, self._world(), weight)
+
+    def _known(self) -> list[int]:
+        """Keyframes whose axes count."""
+        known = self._store["axes_information"].flatten(1).any(dim=1)
+        return [int(k) for k in known.nonzero().flatten().tolist()]
+
+    def _world(self) -> Tensor:
+        """[3,3] float64 from the axes to the world: as the first keyframe that has them sees it.
+
+        The first pose is held while others move, so it is what they go by.
+        """
+        store, known = self._store, self._known()
+        if not known:
+            return torch.eye(3, dtype=torch.float64, device=store.device)
+        R = rotation(store.T_cw[known[0]].double())
+        return R.mT @ store["axes"][known[0]]
+
+    def _expected(self, number: int) -> Tensor:
+        """[3,3] axes of a keyframe as its pose has them."""
+        return rotation(self._store.T_cw[number].double()) @ self._world()
+
+    def _rays(self, number: int, gate: Tensor) -> LineRays:
+        """Lines of a keyframe, but for those whose middle is closed."""
+        store = self._store
+        segments = store.infos[number].lines
+        if segments is None:
+            segments = np.zeros((0, 4), np.float32)
+        open_ = self._open(segments, gate.cpu().numpy())
+        return LineRays(segments[open_], store.image_intrinsics.double().cpu().tolist())
+
+    def _open(
+        self, segments: npt.NDArray[np.float32], gate: npt.NDArray[np.float32]
+    ) -> npt.NDArray[np.bool_]:
+        grid = self._store.grid
+        middle = 0.5 * (segments[:, :2] + segments[:, 2:])
+        cell = np.rint((middle - grid.offset) / grid.stride).astype(np.int64)
+        x, y = cell[:, 0].clip(0, grid.width - 1), cell[:, 1].clip(0, grid.height - 1)
+        return np.asarray(gate[y, x] >= 0.5)
+
+    def _keep(self, number: int, axes: Axes | None) -> None:
+        store = self._store
+        if axes is None or axes.share < _KNOWN:
+            store["axes_information"][number] = 0.0
+            return
+        store["axes"][number] = upload(torch.from_numpy(axes.turn), store.device)
+        store["axes_information"][number] = upload(torch.from_numpy(axes.information), store.device)

@@ -1,0 +1,194 @@
+"""Keyframes that are turned as the lines in them say."""
+
+from __future__ import annotations
+
+import logging
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.config.schema import LinesConfig
+from droidw.geometry import se3
+from droidw.geometry.camera import Grid
+from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.slam.timing import Stopwatch
+from droidw.slam.upright import Upright
+
+GRID, INTRINSICS = Grid(15, 20, 16, 7.5), torch.tensor([200.0, 200.0, 160.0, 120.0])
+COUNT = 8
+
+
+def turn(*w):
+    return se3.exp(torch.tensor([0.0, 0, 0, *w], dtype=torch.float64))
+
+
+def apart(one, other):
+    """Degrees between the rotations of two poses [...,7]."""
+    w = se3.log(se3.mul(one.double(), se3.inv(other.double())))[..., 3:]
+    return torch.rad2deg(w.norm(dim=-1))
+
+
+def lines_of(pose, random, count=40):
+    """Segments [count,4] along the axes of the world, as a camera sees them."""
+    R = se3.rotation(pose.double()).numpy()
+    middle = random.uniform((-2, -1.5, 3), (2, 1.5, 5), (count, 3))
+    along = 0.4 * R.T[np.arange(count) % 3]
+    ends = np.stack([middle - along, middle + along], axis=1)
+    return (200.0 * ends[..., :2] / ends[..., 2:] + (160, 120)).reshape(count, 4)
+
+
+def poses(count=COUNT):
+    """A camera that turns and goes on; the first one is not turned."""
+    made = [torch.tensor([0, 0, 0, 0, 0, 0, 1.0])]
+    motion = se3.exp(torch.tensor([0.1, 0.0, 0.02, 0.01, 0.05, 0.0]))
+    for _ in range(count - 1):
+        made.append(se3.mul(motion, made[-1]))
+    return torch.stack(made)
+
+
+@pytest.fixture
+def build():
+    """Keyframes whose poses have not been turned, and what lines say of the true ones."""
+
+    def make(weight=30.0, least_share=0.75, lines=None, gates=None, known=True):
+        true = poses()
+        random = np.random.default_rng(0)
+        found = [lines_of(pose, random) for pose in true] if lines is None else lines
+        part = SimpleNamespace(line_segments=lambda number: found[number])
+        store = KeyframeStore(GRID, INTRINSICS)
+        upright = Upright(
+            store,
+            part if known else SimpleNamespace(),
+            LinesConfig(weight, least_share),
+            gates or (lambda first: torch.ones(len(store) - first, GRID.height, GRID.width)),
+            Stopwatch(),
+        )
+        still = torch.tensor([0, 0, 0, 0, 0, 0, 1.0])
+
+        def append(number, pose=still):
+            image = np.zeros((240, 320, 3), np.uint8)
+            store.append(KeyframeInfo(number, 0.1 * number, "", image, number), T_cw=pose)
+            upright.see(number)
+
+        return upright, store, append, true
+
+    return make
+
+
+def test_the_first_keyframes_are_turned_together(build, caplog):
+    upright, store, append, true = build()
+    for number in range(COUNT - 1):
+        append(number)
+    assert upright.holds is None
+    assert bool((apart(store.T_cw, true[:1]) < 1e-3).all())
+    with caplog.at_level(logging.INFO, "droidw"):
+        upright.begin()
+    assert upright.holds
+    assert "100 %" in caplog.text
+    assert float(apart(store.T_cw, true[: COUNT - 1]).max()) < 0.05
+    # Where they are is left to matches.
+    assert float(store.T_cw[:, :3].abs().max()) == 0.0
+
+
+def test_a_later_keyframe_is_turned_about_its_centre(build):
+    upright, store, append, true = build()
+    for number in range(COUNT - 1):
+        append(number)
+    upright.begin()
+    guess = se3.mul(se3.exp(torch.tensor([0.0, 0, 0, 0.1, -0.15, 0.05])), true[-1])
+    append(COUNT - 1, guess)
+    assert float(apart(store.T_cw[-1], true[-1])) < 0.05
+    assert torch.allclose(se3.inv(store.T_cw[-1])[:3], se3.inv(guess)[:3], atol=1e-6)
+
+
+def test_what_lines_say_leads_back(build):
+    upright, store, append, true = build()
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    store.T_cw[3] = se3.mul(turn(0.02, 0.01, -0.03).float(), store.T_cw[3])
+    term = upright.term(store.T_cw[2:], 2, usual=0.01)
+    term.check(COUNT - 2)
+    assert float(term.band[0].abs().max()) > 0
+    step = torch.linalg.solve(term.band[1, 0, 3:, 3:], term.rhs[1, 3:])
+    back = se3.mul(turn(*step.tolist()), store.T_cw[3].double())
+    assert float(apart(back, true[3])) < 0.1
+    other = upright.term(store.T_cw[2:], 2, usual=0.02)
+    assert torch.allclose(other.rhs, 2 * term.rhs)
+
+
+def askew(count=COUNT, seed=1):
+    """Lines of no direction."""
+    random = np.random.default_rng(seed)
+    a = random.uniform(20, 200, (count, 40, 2))
+    return list(np.concatenate([a, a + random.uniform(-60, 60, a.shape)], axis=2))
+
+
+def test_lines_of_no_direction_do_not_count(build):
+    upright, store, append, true = build(lines=askew())
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    assert upright.holds is False
+    assert bool((apart(store.T_cw, true[:1]) < 1e-3).all())
+    assert upright.term(store.T_cw, 0, 1.0) is None
+    upright.turn(3)
+    assert upright.again() == 0.0
+
+
+def test_nor_do_those_that_uncertainty_closes(build):
+    """In half of the picture lines stand askew; where it is closed the others decide."""
+    random = np.random.default_rng(2)
+    mixed = []
+    for pose, other in zip(poses(), askew(seed=5), strict=True):
+        good = lines_of(pose, random)
+        good = good[good[:, [0, 2]].mean(axis=1) > 165]
+        bad = other * (0.6, 1.0, 0.6, 1.0)
+        mixed.append(np.concatenate([good, bad[bad[:, [0, 2]].mean(axis=1) < 150]]))
+
+    def closed(first):
+        gates = torch.ones(COUNT - first, GRID.height, GRID.width)
+        gates[:, :, : GRID.width // 2] = 0.0
+        return gates
+
+    for gates, holds in ((None, False), (closed, True)):
+        upright, store, append, true = build(lines=mixed, gates=gates, least_share=0.9)
+        for number in range(COUNT):
+            append(number)
+        upright.begin()
+        assert upright.holds is holds
+    assert float(apart(store.T_cw, true).max()) < 0.1
+
+
+@pytest.mark.parametrize("how", [{"weight": 0.0}, {"known": False}])
+def test_where_lines_are_not_asked_nothing_happens(build, how):
+    upright, store, append, _ = build(**how)
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    assert upright.holds is False
+    assert store.infos[0].lines is None
+    assert upright.term(store.T_cw, 0, 1.0) is None
+
+
+def test_few_keyframes_without_lines_decide_against(build):
+    upright, _store, append, _ = build(lines=[np.zeros((0, 4))] * COUNT)
+    append(0)
+    upright.begin()
+    assert upright.holds is False
+
+
+def test_another_store_goes_by_the_same_decision(build):
+    upright, store, append, true = build()
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    other, backwards, *_ = build()
+    other.like(upright)
+    for number in reversed(range(COUNT)):
+        backwards.append(store.infos[number], **store.values(number))
+    backwards.T_cw[3] = se3.mul(turn(0.3, 0, 0).float(), backwards.T_cw[3])
+    other.turn(3)
+    assert float(apart(backwards.T_cw[3], true[COUNT - 1 - 3])) < 0.05

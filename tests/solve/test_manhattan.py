@@ -1,0 +1,190 @@
+"""How a camera is turned, from lines along three directions at right angles."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from droidw.geometry import se3
+from droidw.solve.manhattan import (
+    LineRays,
+    axes_in_turn,
+    named_like,
+    next_axes,
+    rotation_term,
+)
+
+INTRINSICS = (200.0, 210.0, 160.0, 120.0)
+
+
+def turned(*degrees):
+    return cv2.Rodrigues(np.radians(np.array(degrees, float)))[0]
+
+
+def angle(one, other):
+    return np.degrees(np.linalg.norm(cv2.Rodrigues(one @ other.T)[0]))
+
+
+def project(X):
+    fx, fy, cx, cy = INTRINSICS
+    return np.stack([fx * X[:, 0] / X[:, 2] + cx, fy * X[:, 1] / X[:, 2] + cy], axis=1)
+
+
+def seen(turn, count=30, astray=0, noise=0.0, seed=0):
+    """Segments [n,4] along the columns of `turn`, and `astray` of no direction."""
+    random = np.random.default_rng(seed)
+    middle = np.concatenate(
+        [random.uniform(-0.5, 0.5, (count, 2)), np.ones((count, 1))], axis=1
+    ) * random.uniform(2.0, 5.0, (count, 1))
+    along = turn.T[np.arange(count) % 3]
+    half = random.uniform(0.1, 0.8, (count, 1))
+    lines = np.concatenate([project(middle - half * along), project(middle + half * along)], axis=1)
+    other = random.uniform(20, 220, (astray, 2))
+    other = np.concatenate([other, other + random.uniform(-40, 40, (astray, 2))], axis=1)
+    lines = np.concatenate([lines, other])
+    return lines + noise * random.standard_normal(lines.shape)
+
+
+TURN = turned(10, -25, 7)
+
+
+def test_lines_point_to_their_vanishing_points():
+    rays = LineRays(seen(TURN), INTRINSICS)
+    least = np.abs(rays.distances(TURN)).min(axis=1)
+    assert least.max() < 1e-9
+    assert float(rays.cost(TURN)) < 1e-9
+    assert rays.axes(TURN).share == 1.0
+    off = np.abs(rays.distances(TURN @ turned(3, 0, 0))).min(axis=1)
+    assert off.max() > 0.5
+
+
+def test_distance_is_that_of_an_end_from_the_line_to_the_vanishing_point():
+    segment = np.array([[100.0, 90.0, 140.0, 120.0]])
+    rays = LineRays(segment, INTRINSICS)
+    fx, fy, cx, cy = INTRINSICS
+    away, end = np.array([120.0, 105.0]), np.array([140.0, 120.0])
+    for axis, found in enumerate(np.abs(rays.distances(TURN))[0]):
+        v = TURN[:, axis]
+        vanishing = np.array([fx * v[0] / v[2] + cx, fy * v[1] / v[2] + cy])
+        way = (vanishing - away) / np.linalg.norm(vanishing - away)
+        distance = abs((end - away) @ np.array([-way[1], way[0]]))
+        # rays are scaled by the mean of both focal lengths, which here differ by a twentieth
+        assert found == pytest.approx(distance, rel=0.06)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_picture_tells_how_it_is_turned(seed):
+    rays = LineRays(seen(TURN, astray=12, noise=0.15, seed=seed), INTRINSICS)
+    best = named_like(rays.candidates()[0], TURN)
+    assert angle(best, TURN) < 0.5
+    assert rays.axes(best).share > 0.6
+
+
+def test_information_is_what_noise_leaves():
+    noise, errors, told = 0.15, [], []
+    for seed in range(40):
+        rays = LineRays(seen(TURN, count=60, noise=noise, seed=seed), INTRINSICS)
+        found = rays.fitted(TURN)
+        errors.append(cv2.Rodrigues(found @ TURN.T)[0][:, 0])
+        told.append(np.linalg.inv(rays.axes(found).information))
+    spread = np.cov(np.array(errors).T)
+    # An end and its middle are half the difference of both ends: noise over root two.
+    expected = np.mean(told, axis=0) * (noise / np.sqrt(2) / 0.2) ** 2
+    assert np.trace(spread) == pytest.approx(np.trace(expected), rel=0.6)
+
+
+def test_names_change_and_the_turn_does_not():
+    other = turned(1, 1, 1)
+    for names in (turned(0, 0, 90), turned(90, 0, 0) @ turned(0, 90, 0)):
+        assert angle(named_like(other @ names, other), other) < 1e-6
+
+
+def test_a_fit_comes_from_far():
+    rays = LineRays(seen(TURN, astray=6, noise=0.1), INTRINSICS)
+    assert angle(rays.fitted(turned(6, 5, -4) @ TURN), TURN) < 0.5
+
+
+def test_the_next_picture_is_looked_for_near_the_last():
+    rays = LineRays(seen(TURN, noise=0.1), INTRINSICS)
+    near = turned(0, 12, 0) @ TURN
+    found = next_axes(rays, [near])
+    assert found is not None
+    assert angle(found.turn, TURN) < 0.5
+    assert found.share > 0.9
+    few = LineRays(seen(TURN, count=4), INTRINSICS)
+    assert next_axes(few, [near]) is None
+    assert next_axes(rays, []) is None
+
+
+def test_pictures_in_turn_have_the_same_names_and_outvote_one_that_is_misled():
+    turns = [turned(0, 4 * k, 0) @ TURN for k in range(8)]
+    pictures = [LineRays(seen(turn, noise=0.1, seed=k), INTRINSICS) for k, turn in enumerate(turns)]
+    # In the first most of the lines are those of something that stands askew.
+    askew = np.concatenate(
+        [seen(turned(0, 33, 14) @ turns[0], count=40), seen(turns[0], count=21, noise=0.1, seed=9)]
+    )
+    pictures[0] = LineRays(askew, INTRINSICS)
+    alone = pictures[0].candidates()[0]
+    assert angle(named_like(alone, turns[0]), turns[0]) > 5
+    found = axes_in_turn(pictures)
+    names = named_like(found[0].turn, turns[0]).T @ found[0].turn
+    for axes, turn in zip(found, turns, strict=True):
+        assert angle(axes.turn, turn @ names) < 0.7
+
+
+def test_pictures_without_lines_have_no_axes():
+    pictures = [LineRays(np.zeros((0, 4)), INTRINSICS), LineRays(seen(TURN), INTRINSICS)]
+    assert axes_in_turn(pictures)[0] is None
+    assert axes_in_turn(pictures)[1] is not None
+    assert axes_in_turn([]) == []
+    assert axes_in_turn(pictures[:1]) == [None]
+
+
+def poses(count=5, seed=3):
+    g = torch.Generator().manual_seed(seed)
+    return se3.exp(0.4 * torch.randn(count, 6, generator=g, dtype=torch.float64))
+
+
+def information(count, seed=4):
+    g = torch.Generator().manual_seed(seed)
+    root = torch.randn(count, 3, 3, generator=g, dtype=torch.float64)
+    return root @ root.mT
+
+
+def test_the_term_is_what_differentiation_finds():
+    T, H = poses(), information(5)
+    upright = torch.from_numpy(TURN)
+    off = se3.exp(0.02 * torch.randn(5, 6, dtype=torch.float64, generator=torch.manual_seed(0)))
+    turns = se3.rotation(off) @ se3.rotation(T) @ upright
+    term = rotation_term(T, turns, H, upright, 3.0)
+    term.check(5)
+
+    def energy(x):
+        R = se3.rotation(se3.mul(se3.exp(x), T))
+        M = turns @ upright.T @ R.mT
+        away = torch.nn.functional.pad(M, (0, 1))
+        w = se3.log(se3.from_matrix(away))[:, 3:]
+        return 3.0 * torch.einsum("ni,nij,nj->", w, H, w)
+
+    x = torch.zeros(5, 6, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad(energy(x), x)
+    assert torch.allclose(term.rhs, -0.5 * gradient, rtol=0.03, atol=1e-3)
+    # A whole step of it alone brings every camera where its lines say.
+    step = torch.zeros(5, 6, dtype=torch.float64)
+    step[:, 3:] = torch.linalg.solve(term.band[:, 0, 3:, 3:], term.rhs[:, 3:])
+    assert float(energy(step)) < 1e-3 * float(energy(torch.zeros_like(step)))
+
+
+def test_the_term_is_silent_where_lines_are():
+    T, upright = poses(), torch.eye(3, dtype=torch.float64)
+    H = information(5)
+    H[2] = 0.0
+    term = rotation_term(T, torch.zeros(5, 3, 3, dtype=torch.float64), H * 0, upright, 3.0)
+    assert float(term.band.abs().sum()) == 0.0
+    assert bool(torch.isfinite(term.rhs).all())
+    assert float(term.rhs.abs().sum()) == 0.0
+    term = rotation_term(T, se3.rotation(T), H, upright, 3.0)
+    assert float(term.band[2].abs().sum()) == 0.0
+    assert float(term.rhs.abs().max()) < 1e-9
