@@ -80,10 +80,10 @@ class MotionFilterConfig:
 
     threshold: float = opt(1.25, "mean flow from the last keyframe, in grid cells", gt=0)
     movable_above: float = opt(
-        0.0,
+        0.1,
         "cells of the last keyframe with more evidence than this for what can move by itself do "
-        "not tell how far a picture moved, where uncertainty begins with that (0: all do; 0.1 "
-        "makes keyframes nearer where something hides the motion of the camera)",
+        "not tell how far a picture moved, where uncertainty begins with that: keyframes come "
+        "nearer where something hides the motion of the camera (0: all do)",
         ge=0,
         le=1,
     )

@@ -10,7 +10,7 @@ import torch
 from droidw.config.schema import PhaseConfig, SolverConfig, WeightingConfig
 from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
-from droidw.geometry.se3 import exp, inv, log, mul
+from droidw.geometry.se3 import exp, inv, log, mul, rotation
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import neighbour_edges
 from droidw.interfaces.correspondence import EdgeUpdate
@@ -18,6 +18,7 @@ from droidw.slam.locate import locate
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.timing import Stopwatch
 from droidw.solve.kernel import redescended
+from droidw.solve.manhattan import rotation_term
 from droidw.solve.problem import BAProblem
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 
@@ -80,7 +81,7 @@ def located(spoilt):
     row = graph.pairs.index((last - 3, last))
     optimiser.store.write(T_cw, optimiser.store.disps)
 
-    def call(targets, solver):
+    def call(targets, solver, known=None):
         count = len(targets)
         answer = EdgeUpdate(torch.stack(targets), graph.confidence[[row] * count])
         session = SimpleNamespace(update=lambda request: answer)
@@ -96,6 +97,7 @@ def located(spoilt):
             iterations=20,
             solver=solver,
             label="test",
+            known=known,
         )
 
     call.target = graph.target[row]
@@ -115,6 +117,30 @@ def test_a_frame_does_not_share_the_width_of_its_kernel_with_others(located):
     together = located([exact, rough], solver)
     alone = torch.cat([located([one], solver) for one in (exact, rough)])
     assert torch.allclose(together, alone, atol=1e-5)
+
+
+def test_what_is_known_of_a_frame_besides_counts(spoilt, located):
+    _, _, T_cw = spoilt
+    turned = mul(exp(torch.tensor([[0.0, 0, 0, 0.03, -0.02, 0.01]])), T_cw[-1:])
+    usual = []
+
+    def known(poses, square):
+        usual.append(square)
+        weight = 1e6 * torch.eye(3, dtype=torch.float64)[None]
+        still = torch.eye(3, dtype=torch.float64)
+        return rotation_term(poses, rotation(turned.double()), weight, still, 1.0)
+
+    free = located([located.target], robust(0.2))
+    held = located([located.target], robust(0.2), known)
+    assert apart(rotated(held), rotated(turned)) < 1e-3
+    assert apart(rotated(free), rotated(turned)) > 0.02
+    # The rest of a pose is still what matches say, given that turn.
+    assert apart(held, turned) > 0
+    assert all(square > 0 for square in usual)
+
+
+def rotated(T_cw):
+    return torch.cat([torch.zeros_like(T_cw[:, :3]), T_cw[:, 3:]], dim=1)
 
 
 @pytest.fixture

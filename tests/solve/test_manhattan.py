@@ -188,3 +188,13 @@ def test_the_term_is_silent_where_lines_are():
     term = rotation_term(T, se3.rotation(T), H, upright, 3.0)
     assert float(term.band[2].abs().sum()) == 0.0
     assert float(term.rhs.abs().max()) < 1e-9
+
+
+def test_the_term_moves_behind_poses_of_which_nothing_is_known():
+    T, H = poses(), information(5)
+    upright = torch.from_numpy(TURN)
+    term = rotation_term(T, se3.rotation(poses(seed=5)) @ upright, H, upright, 3.0)
+    moved = term.after(2)
+    moved.check(7)
+    steps = torch.randn(7, 6, dtype=torch.float64, generator=torch.manual_seed(1))
+    assert float(moved.energy(steps)) == pytest.approx(float(term.energy(steps[2:])), rel=1e-12)
