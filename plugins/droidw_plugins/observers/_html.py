@@ -26,7 +26,7 @@ h2{font-size:18px;margin:0 0 4px;letter-spacing:-.005em}
 section{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:18px 20px;
 margin-top:16px}
 .hint{color:var(--soft);font-size:13.5px;margin:0 0 12px;max-width:110ch}
-.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(140px,1fr));gap:12px}
+.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(160px,1fr));gap:12px}
 .tile{background:var(--card);border:1px solid var(--line);border-radius:12px;padding:12px 14px}
 .tile b{display:block;font-size:26px;line-height:1.25;font-weight:650;
 font-variant-numeric:tabular-nums;white-space:nowrap}
