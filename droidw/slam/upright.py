@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,14 @@ import torch
 
 from droidw.geometry.se3 import from_matrix, inv, rotation
 from droidw.geometry.transfer import upload
-from droidw.solve.manhattan import Axes, LineRays, axes_in_turn, next_axes, rotation_term
+from droidw.solve.manhattan import (
+    Axes,
+    LineRays,
+    angle_between,
+    axes_in_turn,
+    next_axes,
+    rotation_term,
+)
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -29,6 +36,8 @@ _log = logging.getLogger(__name__)
 
 # Share of the length of lines that must agree with the axes of a picture, for these to count.
 _KNOWN = 0.6
+# Radians between a frame that was found between keyframes and what its lines say, at most.
+_BETWEEN = np.radians(3.0)
 
 
 class Upright:
@@ -77,7 +86,9 @@ class Upright:
             near = [self._expected(number).cpu().numpy()]
             known = self._known()
             near += [store["axes"][known[-1]].cpu().numpy()] if known else []
-            self._keep(number, next_axes(self._rays(number, self._gates(number)[0]), near))
+            self._keep(
+                number, next_axes(self._rays(self._lines(number), self._gates(number)[0]), near)
+            )
             self.turn(number)
 
     def begin(self) -> None:
@@ -105,7 +116,7 @@ class Upright:
         with self._clock("lines"):
             gates = self._gates(0)
             count = len(self._store)
-            found = axes_in_turn([self._rays(k, gates[k]) for k in range(count)])
+            found = axes_in_turn([self._rays(self._lines(k), gates[k]) for k in range(count)])
             for number, axes in enumerate(found):
                 self._keep(number, axes)
         shares = [0.0 if axes is None else axes.share for axes in found]
@@ -146,6 +157,39 @@ class Upright:
         weight = self._weight * usual
         return rotation_term(T_cw, store["axes"][first:], information, self._world(), weight)
 
+    def between(
+        self, payloads: Sequence[Any], T_cw: Tensor, gates: Tensor
+    ) -> Callable[[Tensor, float], PoseTerm | None] | None:
+        """What lines say of frames that are no keyframes.
+
+        Args:
+            payloads: F, of correspondence. T_cw: [F,7] about where they are.
+            gates: [F,h,w] in [0,1], about what is open in them.
+        Returns:
+            Poses [F,7] and the square of a usual residual -> a term; None where lines do not count.
+        """
+        if not self.holds or self._find is None or not self._known():
+            return None
+        world = self._world()
+        turns = torch.zeros(len(payloads), 3, 3, dtype=world.dtype)
+        information = torch.zeros_like(turns)
+        with self._clock("lines"):
+            expected = (rotation(T_cw.double()) @ world).cpu().numpy()
+            for k, payload in enumerate(payloads):
+                segments = np.asarray(self._find(payload), np.float32)
+                axes = next_axes(self._rays(segments, gates[k]), [expected[k]])
+                if axes is None or axes.share < _KNOWN:
+                    continue
+                if angle_between(axes.turn, expected[k]) < _BETWEEN:
+                    turns[k] = torch.from_numpy(axes.turn)
+                    information[k] = torch.from_numpy(axes.information)
+        turns, information = turns.to(world.device), information.to(world.device)
+
+        def known(T_cw: Tensor, usual: float) -> PoseTerm:
+            return rotation_term(T_cw, turns, information, world, self._weight * usual)
+
+        return known
+
     def _known(self) -> list[int]:
         """Keyframes whose axes count."""
         known = self._store["axes_information"].flatten(1).any(dim=1)
@@ -166,14 +210,14 @@ class Upright:
         """[3,3] axes of a keyframe as its pose has them."""
         return rotation(self._store.T_cw[number].double()) @ self._world()
 
-    def _rays(self, number: int, gate: Tensor) -> LineRays:
-        """Lines of a keyframe, but for those whose middle is closed."""
-        store = self._store
-        segments = store.infos[number].lines
-        if segments is None:
-            segments = np.zeros((0, 4), np.float32)
+    def _lines(self, number: int) -> npt.NDArray[np.float32]:
+        lines = self._store.infos[number].lines
+        return np.zeros((0, 4), np.float32) if lines is None else lines
+
+    def _rays(self, segments: npt.NDArray[np.float32], gate: Tensor) -> LineRays:
+        """Lines of a picture, but for those whose middle is closed."""
         open_ = self._open(segments, gate.cpu().numpy())
-        return LineRays(segments[open_], store.image_intrinsics.double().cpu().tolist())
+        return LineRays(segments[open_], self._store.image_intrinsics.double().cpu().tolist())
 
     def _open(
         self, segments: npt.NDArray[np.float32], gate: npt.NDArray[np.float32]

@@ -22,7 +22,15 @@ from torch import Tensor
 from droidw.geometry.se3 import from_matrix, log, rotation
 from droidw.solve.problem import PoseTerm
 
-__all__ = ["Axes", "LineRays", "axes_in_turn", "named_like", "next_axes", "rotation_term"]
+__all__ = [
+    "Axes",
+    "LineRays",
+    "angle_between",
+    "axes_in_turn",
+    "named_like",
+    "next_axes",
+    "rotation_term",
+]
 
 Array = npt.NDArray[np.float64]
 
@@ -32,8 +40,8 @@ _FAR, _COMPARED = 0.2, 0.5
 _NEAR = (1.0, 0.5, 0.3, 0.2)
 _FROM_AFAR = (4.0, 2.0, *_NEAR)
 _ROUNDS = 3
-# Radians that one step of a fit turns at most.
-_STEP = 0.1
+# Radians that one step of a fit turns at most, and below which there is no other.
+_STEP, _SETTLED = 0.1, 1e-6
 # Lines, longest first, whose directions make starts; and starts that are fitted.
 _STARTS, _FITTED = 14, 3
 # Sine of the angle between two lines' planes below which they tell no direction.
@@ -44,8 +52,9 @@ _LEAST = 6
 _AGREES = np.radians(1.5)
 # Radians from one picture to the next by which directions are still followed.
 _FOLLOWED = np.radians(20.0)
-# Pictures of a sequence from each of which the others are tried to be followed.
-_SEEDS = 6
+# Pictures of a sequence from each of which the others are tried to be followed; radians from what
+# has been followed through a picture below which a start there leads to the same.
+_SEEDS, _SAME = 6, np.radians(2.0)
 
 
 def _changes_of_names() -> Array:
@@ -132,8 +141,10 @@ class LineRays:
             for _ in range(_ROUNDS):
                 H, g = self._equations(turn, width)
                 step = np.linalg.solve(H + (1e-6 * np.trace(H) + 1e-9) * np.eye(3), g)
-                step *= min(1.0, _STEP / max(float(np.linalg.norm(step)), 1e-12))
-                turn = cv2.Rodrigues(step)[0] @ turn
+                size = float(np.linalg.norm(step))
+                turn = cv2.Rodrigues(step * min(1.0, _STEP / max(size, 1e-12)))[0] @ turn
+                if size < _SETTLED:
+                    break
         return turn
 
     def candidates(self) -> list[Array]:
@@ -160,9 +171,11 @@ class LineRays:
     def _measured(self, turn: Array) -> tuple[Array, Array]:
         """Distances, and by what they are divided: how far the vanishing point is."""
         points = np.swapaxes(turn, -1, -2)
-        off = np.einsum("...ak,nk->...na", points, self._cross)
-        toward = np.cross(self._middle[:, None], points[..., None, :, :])
-        far = np.hypot(toward[..., 0], toward[..., 1]) + 1e-9
+        off = self._cross @ turn
+        # the picture of the line through the middle, along its normal
+        x, y, z = (points[..., None, :, k] for k in range(3))
+        across = self._middle[:, 1:2] * z - y, x - self._middle[:, :1] * z
+        far = np.sqrt(across[0] ** 2 + across[1] ** 2) + 1e-9
         return self._focal * off / far, far
 
     def _equations(self, turn: Array, width: float) -> tuple[Array, Array]:
@@ -208,11 +221,12 @@ def _followed(lines: LineRays, candidates: Sequence[Array], near: Sequence[Array
     turns = [lines.fitted(guess) for guess in near]
     for guess in near:
         named = (named_like(turn, guess) for turn in candidates)
-        turns.extend(turn for turn in named if _angle(turn, guess) < _FOLLOWED)
+        turns.extend(turn for turn in named if angle_between(turn, guess) < _FOLLOWED)
     return lines.axes(min(turns, key=lambda turn: float(lines.cost(turn))))
 
 
-def _angle(one: Array, other: Array) -> float:
+def angle_between(one: Array, other: Array) -> float:
+    """Radians by which rotations [3,3] differ."""
     return float(np.arccos(np.clip((np.sum(one * other) - 1.0) / 2.0, -1.0, 1.0)))
 
 
@@ -230,21 +244,29 @@ def axes_in_turn(pictures: Sequence[LineRays]) -> list[Axes | None]:
     if not usable:
         return found
     candidates = {k: pictures[k].candidates() for k in usable}
-    least = np.inf
-    for seed in usable[:: max(1, len(usable) // _SEEDS)]:
+    chains: list[dict[int, Axes]] = []
+    for at in range(0, len(usable), max(1, len(usable) // _SEEDS)):
+        seed = usable[at]
         for start in candidates[seed]:
+            if any(
+                angle_between(named_like(start, c[seed].turn), c[seed].turn) < _SAME for c in chains
+            ):
+                continue
             chain = {seed: pictures[seed].axes(start)}
-            at = usable.index(seed)
             for way in (usable[at + 1 :], usable[:at][::-1]):
                 near = start
                 for k in way:
                     chain[k] = _followed(pictures[k], candidates[k], [near])
                     near = chain[k].turn
-            cost = sum(float(pictures[k].cost(axes.turn)) for k, axes in chain.items())
-            if cost < least:
-                least = cost
-                found = [chain.get(k) for k in range(len(pictures))]
-    return found
+            chains.append(chain)
+    if not chains:
+        return found
+    best = min(chains, key=lambda chain: _cost(pictures, chain))
+    return [best.get(k) for k in range(len(pictures))]
+
+
+def _cost(pictures: Sequence[LineRays], chain: dict[int, Axes]) -> float:
+    return sum(float(pictures[k].cost(axes.turn)) for k, axes in chain.items())
 
 
 def rotation_term(
