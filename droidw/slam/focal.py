@@ -124,6 +124,8 @@ def refine_focal(
     def energy(x: float) -> float:
         place(x)
         store.write(*start)
+        # Axes by another focal length would hold on to it.
+        optimiser.upright.measure()
         optimiser.adjust(graph, rows, steps, solver, first_free=1)
         states[x] = store.T_cw.clone(), store.disps.clone()
         return optimiser.cost
@@ -131,6 +133,7 @@ def refine_focal(
     trust, bound = camera.focal_trust, camera.focal_range
     x, tried = minimise_with_prior(energy, trust if known else _GUESSED * trust, bound)
     place(x)
+    optimiser.upright.measure()
     store.write(*states[x])
     return FocalSearch(math.exp(x), tuple((math.exp(k), value) for k, value in tried))
 

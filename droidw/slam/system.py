@@ -330,7 +330,6 @@ class SlamSystem:
         if focal is not None and focal.factor != 1.0:
             fx, fy = self.camera.fx * focal.factor, self.camera.fy * focal.factor
             self.camera = replace(self.camera, fx=fx, fy=fy)
-            self.optimiser.upright.again()
 
     def _hold_still(self) -> None:
         """A camera at rest: every pose is the first, and no depth can be known."""

@@ -106,11 +106,17 @@ class Upright:
                     self.turn(number, still=True)
 
     def again(self) -> float:
-        """Measure the axes of all keyframes, by the gates and the focal length of now.
+        """Measure the axes of all keyframes, by gates and focal length of now, and decide anew.
 
         Returns:
             The share of the length of lines that agrees with them, of half of the keyframes.
         """
+        share = self.measure()
+        self.holds = bool(self.holds) and share >= self._least_share
+        return share
+
+    def measure(self) -> float:
+        """The same, and lines count as before."""
         if not self.holds:
             return 0.0
         with self._clock("lines"):
@@ -120,9 +126,7 @@ class Upright:
             for number, axes in enumerate(found):
                 self._keep(number, axes)
         shares = [0.0 if axes is None else axes.share for axes in found]
-        share = float(np.median(shares)) if shares else 0.0
-        self.holds = share >= self._least_share
-        return share
+        return float(np.median(shares)) if shares else 0.0
 
     def like(self, other: Upright) -> None:
         """Let lines count as for another store, of the same keyframes."""

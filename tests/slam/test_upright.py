@@ -199,7 +199,7 @@ def test_a_frame_between_keyframes_is_told_how_it_is_turned(build):
     random = np.random.default_rng(0)
     found = [lines_of(pose, random) for pose in true]
     found[6] = askew()[0]
-    upright, store, append, _ = build(lines=found)
+    upright, _, append, _ = build(lines=found)
     opened = torch.ones(3, GRID.height, GRID.width)
     for number in range(5):
         append(number)
@@ -219,3 +219,19 @@ def test_a_frame_between_keyframes_is_told_how_it_is_turned(build):
     # What says that a frame is far from where it was found is not believed.
     far = se3.mul(turn(0.0, 0.1, 0.0).float()[None], true[5:])
     assert float(upright.between([5, 6, 7], far, opened)(far, 0.01).band.abs().max()) == 0.0
+
+
+def test_axes_go_by_the_focal_length(build):
+    upright, store, append, _ = build(least_share=0.2)
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    right = store["axes"].clone()
+    store.image_intrinsics[:2] *= 1.15
+    upright.measure()
+    off = torch.linalg.matrix_norm(store["axes"] - right, dim=(1, 2))
+    assert float(off.max()) > 0.02
+    store.image_intrinsics[:2] /= 1.15
+    upright.again()
+    assert upright.holds
+    assert torch.allclose(store["axes"], right, atol=1e-5)
