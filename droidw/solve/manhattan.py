@@ -42,6 +42,9 @@ _FROM_AFAR = (4.0, 2.0, *_NEAR)
 _ROUNDS = 3
 # Radians that one step of a fit turns at most, and below which there is no other.
 _STEP, _SETTLED = 0.1, 1e-6
+# Focal lengths between a line and its vanishing point within which that hardly says where the line
+# goes: it may lie on the line itself.
+_CLOSE = 0.25
 # Lines, longest first, whose directions make starts; and starts that are fitted.
 _STARTS, _FITTED = 14, 3
 # Sine of the angle between two lines' planes below which they tell no direction.
@@ -114,6 +117,8 @@ class LineRays:
     def distances(self, turn: Array) -> Array:
         """Of the ends from lines through the middles to all vanishing points, [...,n,3] pixels.
 
+        Less where a vanishing point is close.
+
         Args:
             turn: [...,3,3] from axes to camera.
         """
@@ -175,7 +180,7 @@ class LineRays:
         # the picture of the line through the middle, along its normal
         x, y, z = (points[..., None, :, k] for k in range(3))
         across = self._middle[:, 1:2] * z - y, x - self._middle[:, :1] * z
-        far = np.sqrt(across[0] ** 2 + across[1] ** 2) + 1e-9
+        far = np.sqrt(across[0] ** 2 + across[1] ** 2 + (_CLOSE * z) ** 2) + 1e-9
         return self._focal * off / far, far
 
     def _equations(self, turn: Array, width: float) -> tuple[Array, Array]:
@@ -218,10 +223,11 @@ def next_axes(lines: LineRays, near: Sequence[Array]) -> Axes | None:
 
 
 def _followed(lines: LineRays, candidates: Sequence[Array], near: Sequence[Array]) -> Axes:
-    turns = [lines.fitted(guess) for guess in near]
+    turns: list[Array] = []
     for guess in near:
-        named = (named_like(turn, guess) for turn in candidates)
-        turns.extend(turn for turn in named if angle_between(turn, guess) < _FOLLOWED)
+        tried = [lines.fitted(guess), *(named_like(turn, guess) for turn in candidates)]
+        turns.extend(turn for turn in tried if angle_between(turn, guess) < _FOLLOWED)
+        turns.append(lines.fitted(guess, _NEAR))
     return lines.axes(min(turns, key=lambda turn: float(lines.cost(turn))))
 
 

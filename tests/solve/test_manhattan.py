@@ -70,6 +70,8 @@ def test_distance_is_that_of_an_end_from_the_line_to_the_vanishing_point():
         vanishing = np.array([fx * v[0] / v[2] + cx, fy * v[1] / v[2] + cy])
         way = (vanishing - away) / np.linalg.norm(vanishing - away)
         distance = abs((end - away) @ np.array([-way[1], way[0]]))
+        far = np.linalg.norm((vanishing - away) / (fx, fy))
+        distance *= far / np.hypot(far, 0.25)
         # rays are scaled by the mean of both focal lengths, which here differ by a twentieth
         assert found == pytest.approx(distance, rel=0.06)
 
@@ -198,3 +200,18 @@ def test_the_term_moves_behind_poses_of_which_nothing_is_known():
     moved.check(7)
     steps = torch.randn(7, 6, dtype=torch.float64, generator=torch.manual_seed(1))
     assert float(moved.energy(steps)) == pytest.approx(float(term.energy(steps[2:])), rel=1e-12)
+
+
+def test_a_line_through_a_vanishing_point_does_not_tell_where_that_is():
+    fx, fy, cx, cy = INTRINSICS
+    v = TURN[:, 2]
+    vanishing = np.array([fx * v[0] / v[2] + cx, fy * v[1] / v[2] + cy])
+    lines = seen(TURN)
+    reach = np.array([15.0, 9.0])
+    through = np.concatenate([vanishing - reach, vanishing + reach])[None]
+    plain = LineRays(lines, INTRINSICS).axes(TURN).information
+    for off in (0.0, 1e-9, 1e-3, 1.0):
+        rays = LineRays(np.concatenate([lines, through + off]), INTRINSICS)
+        more = rays.axes(TURN).information - plain
+        assert np.abs(more).max() < 0.25 * np.abs(plain).max()
+        assert angle(rays.fitted(turned(2, 1, 0) @ TURN), TURN) < 0.1
