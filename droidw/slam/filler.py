@@ -71,20 +71,15 @@ class Filler:
         return list(self._refine(batch, start, updates).unbind(0))
 
     def _refine(self, batch: list[Encoded], start: Tensor, updates: int) -> Tensor:
-        payloads = [encoded.payload for encoded in batch]
-        before = [self.neighbours(encoded.frame.time)[0] for encoded in batch]
-        # What moves is about where it was in the keyframe before.
-        known = self.optimiser.upright.between(payloads, start, self._gates[before])
         return locate(
             self.optimiser,
-            payloads,
+            [encoded.payload for encoded in batch],
             start,
             [self._sources(encoded.frame.time) for encoded in batch],
             self._gates,
             updates=updates,
             iterations=self.config.schedule["fill"].iterations,
             solver=self.config.filler_solver,
-            known=known,
         )
 
     def _sources(self, time: float) -> list[int]:

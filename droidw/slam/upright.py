@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,6 @@ from droidw.geometry.transfer import upload
 from droidw.solve.manhattan import (
     Axes,
     LineRays,
-    angle_between,
     axes_in_turn,
     next_axes,
     rotation_term,
@@ -36,8 +35,6 @@ _log = logging.getLogger(__name__)
 
 # Share of the length of lines that must agree with the axes of a picture, for these to count.
 _KNOWN = 0.6
-# Radians between a frame that was found between keyframes and what its lines say, at most.
-_BETWEEN = np.radians(3.0)
 
 
 class Upright:
@@ -160,39 +157,6 @@ class Upright:
         information = store["axes_information"][first:]
         weight = self._weight * usual
         return rotation_term(T_cw, store["axes"][first:], information, self._world(), weight)
-
-    def between(
-        self, payloads: Sequence[Any], T_cw: Tensor, gates: Tensor
-    ) -> Callable[[Tensor, float], PoseTerm | None] | None:
-        """What lines say of frames that are no keyframes.
-
-        Args:
-            payloads: F, of correspondence. T_cw: [F,7] about where they are.
-            gates: [F,h,w] in [0,1], about what is open in them.
-        Returns:
-            Poses [F,7] and the square of a usual residual -> a term; None where lines do not count.
-        """
-        if not self.holds or self._find is None or not self._known():
-            return None
-        world = self._world()
-        turns = torch.zeros(len(payloads), 3, 3, dtype=world.dtype)
-        information = torch.zeros_like(turns)
-        with self._clock("lines"):
-            expected = (rotation(T_cw.double()) @ world).cpu().numpy()
-            for k, payload in enumerate(payloads):
-                segments = np.asarray(self._find(payload), np.float32)
-                axes = next_axes(self._rays(segments, gates[k]), [expected[k]])
-                if axes is None or axes.share < _KNOWN:
-                    continue
-                if angle_between(axes.turn, expected[k]) < _BETWEEN:
-                    turns[k] = torch.from_numpy(axes.turn)
-                    information[k] = torch.from_numpy(axes.information)
-        turns, information = turns.to(world.device), information.to(world.device)
-
-        def known(T_cw: Tensor, usual: float) -> PoseTerm:
-            return rotation_term(T_cw, turns, information, world, self._weight * usual)
-
-        return known
 
     def _known(self) -> list[int]:
         """Keyframes whose axes count."""

@@ -25,7 +25,6 @@ from droidw.solve.problem import PoseTerm
 __all__ = [
     "Axes",
     "LineRays",
-    "angle_between",
     "axes_in_turn",
     "named_like",
     "next_axes",
@@ -226,13 +225,12 @@ def _followed(lines: LineRays, candidates: Sequence[Array], near: Sequence[Array
     turns: list[Array] = []
     for guess in near:
         tried = [lines.fitted(guess), *(named_like(turn, guess) for turn in candidates)]
-        turns.extend(turn for turn in tried if angle_between(turn, guess) < _FOLLOWED)
+        turns.extend(turn for turn in tried if _angle(turn, guess) < _FOLLOWED)
         turns.append(lines.fitted(guess, _NEAR))
     return lines.axes(min(turns, key=lambda turn: float(lines.cost(turn))))
 
 
-def angle_between(one: Array, other: Array) -> float:
-    """Radians by which rotations [3,3] differ."""
+def _angle(one: Array, other: Array) -> float:
     return float(np.arccos(np.clip((np.sum(one * other) - 1.0) / 2.0, -1.0, 1.0)))
 
 
@@ -254,9 +252,7 @@ def axes_in_turn(pictures: Sequence[LineRays]) -> list[Axes | None]:
     for at in range(0, len(usable), max(1, len(usable) // _SEEDS)):
         seed = usable[at]
         for start in candidates[seed]:
-            if any(
-                angle_between(named_like(start, c[seed].turn), c[seed].turn) < _SAME for c in chains
-            ):
+            if any(_angle(named_like(start, c[seed].turn), c[seed].turn) < _SAME for c in chains):
                 continue
             chain = {seed: pictures[seed].axes(start)}
             for way in (usable[at + 1 :], usable[:at][::-1]):

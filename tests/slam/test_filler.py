@@ -32,9 +32,7 @@ def sources(arc, waves, stored, monkeypatch):
     def call(*times, keyframes=2, predict="velocity"):
         config = DroidwConfig()
         config.filler.keyframes, config.frontend.predict = keyframes, predict
-        upright = SimpleNamespace(between=lambda payloads, T_cw, gates: None)
-        gates = torch.ones(6, 6, 8)
-        optimiser = SimpleNamespace(store=store, gates=lambda learned: gates, upright=upright)
+        optimiser = SimpleNamespace(store=store, gates=lambda learned: None)
         frames = [SimpleNamespace(frame=SimpleNamespace(time=t), payload=None) for t in times]
         Filler(optimiser, config).fill(frames)
         return asked.pop()

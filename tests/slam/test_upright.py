@@ -194,33 +194,6 @@ def test_another_store_goes_by_the_same_decision(build):
     assert float(apart(backwards.T_cw[3], true[COUNT - 1 - 3])) < 0.05
 
 
-def test_a_frame_between_keyframes_is_told_how_it_is_turned(build):
-    true = poses()
-    random = np.random.default_rng(0)
-    found = [lines_of(pose, random) for pose in true]
-    found[6] = askew()[0]
-    upright, _, append, _ = build(lines=found)
-    opened = torch.ones(3, GRID.height, GRID.width)
-    for number in range(5):
-        append(number)
-    assert upright.between([5], true[5:6], opened[:1]) is None
-    upright.begin()
-    off = torch.tensor([[0.02, 0, 0, 0.015, -0.01, 0.02]])
-    start = se3.mul(se3.exp(off.expand(3, 6)), true[5:])
-    known = upright.between([5, 6, 7], start, opened)
-    term = known(start, 0.01)
-    term.check(3)
-    # Lines of no direction say nothing, others lead back.
-    assert float(term.band[1].abs().max()) == 0.0
-    for k in (0, 2):
-        step = torch.linalg.solve(term.band[k, 0, 3:, 3:], term.rhs[k, 3:])
-        back = se3.mul(turn(*step.tolist()), start[k].double())
-        assert float(apart(back, true[5 + k])) < 0.1
-    # What says that a frame is far from where it was found is not believed.
-    far = se3.mul(turn(0.0, 0.1, 0.0).float()[None], true[5:])
-    assert float(upright.between([5, 6, 7], far, opened)(far, 0.01).band.abs().max()) == 0.0
-
-
 def test_axes_go_by_the_focal_length(build):
     upright, store, append, _ = build(least_share=0.2)
     for number in range(COUNT):

@@ -13,6 +13,7 @@ from droidw.config.load import load_config
 from droidw.config.resolve import resolve
 from droidw.events import Dispatcher
 from droidw.geometry.camera import Rectifier
+from droidw.geometry.se3 import inv, log, mul
 from droidw.plugin.component import BuildContext
 from droidw.slam.frame import RawFrame
 from droidw.slam.optimise import Parts
@@ -125,3 +126,25 @@ def test_what_can_move_is_asked_of_the_keyframes_that_need_it(system, keep, abov
         assert number >= 4 and any(found is one for one in asked)
     for cells, one in zip(aside, asked, strict=False):
         assert torch.equal(cells, one > above)
+
+
+def test_lines_hold_a_rendered_room(system, rendered):
+    """The same whether frames are made ahead, and keyframes turned about as the camera was."""
+    paths = {}
+    for weight, threaded in ((30, False), (30, True), (0, False)):
+        slam, frames = system(threaded, (f"lines.weight={weight}", "lines.least_share=0.2"))
+        slam.track(iter(frames))
+        outcome = slam.finish(lambda frames=frames: iter(frames))
+        known = slam.store["axes_information"].flatten(1).any(dim=1)
+        assert slam.optimiser.upright.holds is (weight > 0)
+        assert int(known.sum()) >= 4 * (weight > 0)
+        assert all((info.lines is None) is (weight == 0) for info in slam.store.infos)
+        paths[weight, threaded] = outcome.trajectory.T_wc
+        true = [rendered("handheld")[1].T_wc(k.index) for k in outcome.keyframes]
+        true = torch.from_numpy(np.stack(true))
+        found = torch.from_numpy(np.stack([k.T_wc for k in outcome.keyframes]))
+        apart = log(mul(mul(inv(found[:1]), found), inv(mul(inv(true[:1]), true))))
+        # One picture of so small a room may be misled, for which lines do not count by default.
+        assert float(torch.rad2deg(apart[:, 3:].norm(dim=1)).median()) < 0.5
+    assert np.array_equal(paths[30, False], paths[30, True])
+    assert not np.array_equal(paths[30, False], paths[0, False])
