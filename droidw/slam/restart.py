@@ -172,6 +172,8 @@ def set_out(
     for k, motion in motions.items():
         changed[k] = motion.to(changed)
     replace(path, T_cw=chained(changed, path.T_cw[0])).write_to(store)
+    for number in range(len(store)):
+        optimiser.upright.turn(number)
     phase = replace(config.schedule["global"], learn=False)
     for solver in backend.narrowing():
         optimiser.adjust(graph, graph.select(), phase, solver, first_free=len(store))

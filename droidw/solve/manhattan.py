@@ -54,6 +54,8 @@ _LEAST = 6
 _AGREES = np.radians(1.5)
 # Radians from one picture to the next by which directions are still followed.
 _FOLLOWED = np.radians(20.0)
+# Radians from what lines say at which a pose is hardly held to it any more.
+_MISLED = np.radians(1.0)
 # Pictures of a sequence from each of which the others are tried to be followed; radians from what
 # has been followed through a picture below which a start there leads to the same.
 _SEEDS, _SAME = 6, np.radians(2.0)
@@ -276,7 +278,8 @@ def rotation_term(
 ) -> PoseTerm:
     """The energy `weight * w^T H w` of how far each camera is turned from what its lines say.
 
-    w is the rotation vector from the one to the other. Linearised.
+    w is the rotation vector from the one to the other. Linearised, and by a Cauchy kernel: one
+    picture in many takes other lines for the axes, and matches know better by then.
 
     Args:
         T_cw: [N,7] poses, world to camera.
@@ -286,7 +289,8 @@ def rotation_term(
     """
     R = rotation(T_cw.double())
     off = _rotation_vector(turns.to(R) @ upright.to(R).mT @ R.mT)
-    H = weight * information.to(R)
+    kept = 1.0 / (1.0 + (off / _MISLED).square().sum(dim=1))
+    H = weight * kept[:, None, None] * information.to(R)
     band = torch.zeros(len(R), 1, 6, 6, dtype=R.dtype, device=R.device)
     rhs = torch.zeros(len(R), 6, dtype=R.dtype, device=R.device)
     band[:, 0, 3:, 3:] = H
