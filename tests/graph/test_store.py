@@ -14,7 +14,7 @@ GRID = Grid(3, 4, 8, 3.5)
 EXTRA = (StoreField("own", (2, "h")), StoreField("count", (), fill=7, dtype="int64"))
 FIELDS = (
     "T_cw", "disps", "prior", "features", "uncertainty", "damping", "unmasked", "movable", "own",
-    "count",
+    "count", "axes", "axes_information",
 )  # fmt: skip
 
 
