@@ -80,8 +80,9 @@ class Upright:
             store.infos[number].lines = np.asarray(self._find(store.payload(number)), np.float32)
             if self.holds is None:
                 return
-            near = [self._expected(number).cpu().numpy()]
             known = self._known()
+            expected = rotation(store.T_cw[number].double()) @ self._world(known)
+            near = [expected.cpu().numpy()]
             near += [store["axes"][known[-1]].cpu().numpy()] if known else []
             self._keep(
                 number, next_axes(self._rays(self._lines(number), self._gates(number)[0]), near)
@@ -140,7 +141,7 @@ class Upright:
             return
         pose = store.T_cw[number].double()
         turned = torch.zeros(3, 4, dtype=pose.dtype, device=pose.device)
-        turned[:, :3] = store["axes"][number] @ self._world().mT
+        turned[:, :3] = store["axes"][number] @ self._world(self._known()).mT
         centre = inv(pose)[:3]
         turned[:, 3] = pose[:3] if still else -turned[:, :3] @ centre
         store.T_cw[number] = from_matrix(turned).to(store.T_cw)
@@ -152,31 +153,28 @@ class Upright:
             usual: square of a usual residual, the unit in which they count.
         """
         store = self._store
-        if not self.holds or not self._known():
+        known = self._known() if self.holds else []
+        if not known:
             return None
         information = store["axes_information"][first:]
         weight = self._weight * usual
-        return rotation_term(T_cw, store["axes"][first:], information, self._world(), weight)
+        return rotation_term(T_cw, store["axes"][first:], information, self._world(known), weight)
 
     def _known(self) -> list[int]:
         """Keyframes whose axes count."""
         known = self._store["axes_information"].flatten(1).any(dim=1)
         return [int(k) for k in known.nonzero().flatten().tolist()]
 
-    def _world(self) -> Tensor:
+    def _world(self, known: list[int]) -> Tensor:
         """[3,3] float64 from the axes to the world: as the first keyframe that has them sees it.
 
         The first pose is held while others move, so it is what they go by.
         """
-        store, known = self._store, self._known()
+        store = self._store
         if not known:
             return torch.eye(3, dtype=torch.float64, device=store.device)
         R = rotation(store.T_cw[known[0]].double())
         return R.mT @ store["axes"][known[0]]
-
-    def _expected(self, number: int) -> Tensor:
-        """[3,3] axes of a keyframe as its pose has them."""
-        return rotation(self._store.T_cw[number].double()) @ self._world()
 
     def _lines(self, number: int) -> npt.NDArray[np.float32]:
         lines = self._store.infos[number].lines

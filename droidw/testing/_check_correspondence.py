@@ -289,10 +289,9 @@ def _points(
     with subject.calling("matched_points"):
         seen = np.asarray(find(payloads[0], payloads[1], gate, gate))
         unseen = np.asarray(find(payloads[0], payloads[1], gate, 0 * gate))
-    within = np.array([size[1], size[0], size[1], size[0]])
     subject.expect(
         "matched_points",
-        seen.ndim == 2 and seen.shape[1] == 4 and bool(((seen > -1) & (seen < within)).all()),
+        _in_pictures(seen, size),
         f"points of pictures of {size[1]}x{size[0]} are {seen!r}; due are rows of x, y here and "
         "x, y there, in pixels of these pictures",
     )
@@ -303,6 +302,14 @@ def _points(
     )
 
 
+def _in_pictures(rows: np.ndarray, size: tuple[int, int]) -> bool:
+    """Whether rows are two places x, y each, in pictures of this height and width."""
+    if rows.ndim != 2 or rows.shape[1] != 4:
+        return False
+    within = np.array([size[1], size[0], size[1], size[0]])
+    return bool(((rows > -1) & (rows < within)).all())
+
+
 def _lines(subject: Subject, part: Any, payloads: list[Any], size: tuple[int, int]) -> None:
     """Straight edges of a picture, where the part finds them."""
     find = getattr(part, "line_segments", None)
@@ -310,10 +317,9 @@ def _lines(subject: Subject, part: Any, payloads: list[Any], size: tuple[int, in
         return
     with subject.calling("line_segments"):
         found, again = (np.asarray(find(payloads[0])) for _ in range(2))
-    within = np.array([size[1], size[0], size[1], size[0]])
     subject.expect(
         "line_segments",
-        found.ndim == 2 and found.shape[1] == 4 and bool(((found > -1) & (found < within)).all()),
+        _in_pictures(found, size),
         f"lines in a picture of {size[1]}x{size[0]} are {found!r}; due are rows of x, y of one end "
         "and x, y of the other, in pixels of the picture",
     )
