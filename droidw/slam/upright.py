@@ -93,7 +93,8 @@ class Upright:
         """Decide by the keyframes so far whether lines count; if so, turn these."""
         if self.holds is None:
             self.holds = True
-            share = self.again()
+            share = self.measure()
+            self.holds = share >= self._least_share
             if self.holds:
                 _log.info(
                     "%.0f %% of the length of lines is along three directions at right angles: "
@@ -103,18 +104,27 @@ class Upright:
                 for number in range(len(self._store)):
                     self.turn(number, still=True)
 
-    def again(self) -> float:
-        """Measure the axes of all keyframes, by gates and focal length of now, and decide anew.
+    def again(self) -> None:
+        """Measure the axes of all keyframes, by gates and focal length of now.
+
+        Where half of the keyframes no longer agree with theirs, lines do not count from then on.
+        """
+        share = self.measure()
+        if self.holds and share < self._least_share:
+            self.holds = False
+            _log.info(
+                "lines no longer count: %.0f %% of their length is along three directions at right "
+                "angles, and lines.least_share is %.2f",
+                100 * share,
+                self._least_share,
+            )
+
+    def measure(self) -> float:
+        """The same, and lines count as before.
 
         Returns:
             The share of the length of lines that agrees with them, of half of the keyframes.
         """
-        share = self.measure()
-        self.holds = bool(self.holds) and share >= self._least_share
-        return share
-
-    def measure(self) -> float:
-        """The same, and lines count as before."""
         if not self.holds:
             return 0.0
         with self._clock("lines"):

@@ -135,7 +135,23 @@ def test_lines_of_no_direction_do_not_count(build):
     assert bool((apart(store.T_cw, true[:1]) < 1e-3).all())
     assert upright.term(store.T_cw, 0, 1.0) is None
     upright.turn(3)
-    assert upright.again() == 0.0
+    assert upright.measure() == 0.0
+
+
+def test_lines_that_lose_their_directions_count_no_longer(build, caplog):
+    upright, store, append, _ = build()
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    upright.again()
+    assert upright.holds
+    for info, lines in zip(store.infos, askew(), strict=True):
+        info.lines = lines
+    with caplog.at_level(logging.INFO, "droidw"):
+        upright.again()
+    assert upright.holds is False
+    assert "no longer count" in caplog.text
+    assert upright.term(store.T_cw, 0, 1.0) is None
 
 
 def test_nor_do_those_that_uncertainty_closes(build):
