@@ -125,7 +125,7 @@ def refine_focal(
         place(x)
         store.write(*start)
         # Axes by another focal length would hold on to it.
-        optimiser.upright.measure()
+        optimiser.upright.refit()
         optimiser.adjust(graph, rows, steps, solver, first_free=1)
         states[x] = store.T_cw.clone(), store.disps.clone()
         return optimiser.cost

@@ -136,6 +136,20 @@ class Upright:
         shares = [0.0 if axes is None else axes.share for axes in found]
         return float(np.median(shares)) if shares else 0.0
 
+    def refit(self) -> None:
+        """Fit the axes that are known to their lines again, by the focal length of now.
+
+        Those of the same keyframes count as before, so that what they cost can be compared.
+        """
+        if not self.holds:
+            return
+        with self._clock("lines"):
+            gates = self._gates(0)
+            for number in self._known():
+                rays = self._rays(self._lines(number), gates[number])
+                axes = rays.axes(rays.fitted(self._store["axes"][number].cpu().numpy()))
+                self._set(number, axes)
+
     def like(self, other: Upright) -> None:
         """Let lines count as for another store, of the same keyframes."""
         self.holds = other.holds
@@ -205,9 +219,12 @@ class Upright:
         return np.asarray(gate[y, x] >= 0.5)
 
     def _keep(self, number: int, axes: Axes | None) -> None:
-        store = self._store
         if axes is None or axes.share < _KNOWN:
-            store["axes_information"][number] = 0.0
-            return
+            self._store["axes_information"][number] = 0.0
+        else:
+            self._set(number, axes)
+
+    def _set(self, number: int, axes: Axes) -> None:
+        store = self._store
         store["axes"][number] = upload(torch.from_numpy(axes.turn), store.device)
         store["axes_information"][number] = upload(torch.from_numpy(axes.information), store.device)

@@ -210,17 +210,41 @@ def test_another_store_goes_by_the_same_decision(build):
     assert float(apart(backwards.T_cw[3], true[COUNT - 1 - 3])) < 0.05
 
 
-def test_axes_go_by_the_focal_length(build):
+@pytest.mark.parametrize("how", ["measure", "refit"])
+def test_axes_go_by_the_focal_length(build, how):
     upright, store, append, _ = build(least_share=0.2)
     for number in range(COUNT):
         append(number)
     upright.begin()
     right = store["axes"].clone()
     store.image_intrinsics[:2] *= 1.15
-    upright.measure()
+    getattr(upright, how)()
     off = torch.linalg.matrix_norm(store["axes"] - right, dim=(1, 2))
     assert float(off.max()) > 0.02
     store.image_intrinsics[:2] /= 1.15
     upright.again()
     assert upright.holds
     assert torch.allclose(store["axes"], right, atol=1e-5)
+
+
+def test_axes_are_fitted_again_where_they_are_known(build):
+    upright, store, append, _ = build()
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    right = store["axes"].clone()
+    store["axes"][2] = se3.rotation(turn(0.03, -0.02, 0.01)) @ right[2]
+    store["axes_information"][5] = 0.0
+    upright.refit()
+    assert torch.allclose(store["axes"], right, atol=1e-5)
+    known = store["axes_information"].flatten(1).any(dim=1)
+    assert known.tolist() == [number != 5 for number in range(COUNT)]
+
+
+def test_nothing_is_fitted_where_lines_do_not_count(build):
+    upright, store, append, _ = build(lines=askew())
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    upright.refit()
+    assert not bool(store["axes_information"].any())
