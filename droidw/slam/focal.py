@@ -120,15 +120,17 @@ def refine_focal(
             intrinsics[:2] = before[:2] * factor
 
     states = {}
+    usual: list[float] = []
 
     def energy(x: float) -> float:
         place(x)
         store.write(*start)
         # Axes by another focal length would hold on to it.
-        optimiser.upright.refit()
+        lines = optimiser.upright.refit()
         optimiser.adjust(graph, rows, steps, solver, first_free=1)
         states[x] = store.T_cw.clone(), store.disps.clone()
-        return optimiser.cost
+        usual.append(optimiser.usual)
+        return optimiser.cost + lines * usual[0]
 
     trust, bound = camera.focal_trust, camera.focal_range
     x, tried = minimise_with_prior(energy, trust if known else _GUESSED * trust, bound)

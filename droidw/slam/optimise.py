@@ -77,6 +77,8 @@ class Optimiser:
             keyframes have a part in: a fifth of a pixel off its epipolar line, a point counts as
             much as so many matches with a usual residual. None: not at all.
         upright: how the keyframes of the store are turned by the lines that they see.
+        cost: energy before the last step. usual: square of a usual residual then, where something
+            counts besides matches.
     """
 
     def __init__(
@@ -109,6 +111,7 @@ class Optimiser:
         self.iterations = 0
         self.reports: dict[str, int] = {}
         self.cost = float("nan")
+        self.usual = 0.0
 
     def beside(self, store: KeyframeStore) -> Optimiser:
         """The same for another store, whose uncertainty begins with what this one has learned."""
@@ -284,7 +287,7 @@ class Optimiser:
         points = self.points if low == 0 else None
         if motion_prior <= 0 and points is None and not self.upright.holds:
             return None
-        usual = usual_square(problem)
+        usual = self.usual = usual_square(problem)
         said = [self.upright.term(problem.T_cw, low, usual)]
         if motion_prior > 0:
             times = torch.tensor(self.store.times()[low:], dtype=torch.float64)

@@ -136,19 +136,24 @@ class Upright:
         shares = [0.0 if axes is None else axes.share for axes in found]
         return float(np.median(shares)) if shares else 0.0
 
-    def refit(self) -> None:
+    def refit(self) -> float:
         """Fit the axes that are known to their lines again, by the focal length of now.
 
         Those of the same keyframes count as before, so that what they cost can be compared.
+
+        Returns:
+            What all lines of these keyframes are off, as `term` counts it where `usual` is 1.
         """
-        if not self.holds:
-            return
-        with self._clock("lines"):
-            gates = self._gates(0)
-            for number in self._known():
-                rays = self._rays(self._lines(number), gates[number])
-                axes = rays.axes(rays.fitted(self._store["axes"][number].cpu().numpy()))
-                self._set(number, axes)
+        energy = 0.0
+        if self.holds:
+            with self._clock("lines"):
+                gates = self._gates(0)
+                for number in self._known():
+                    rays = self._rays(self._lines(number), gates[number])
+                    axes = rays.axes(rays.fitted(self._store["axes"][number].cpu().numpy()))
+                    self._set(number, axes)
+                    energy += rays.energy(axes.turn)
+        return self._weight * energy
 
     def like(self, other: Upright) -> None:
         """Let lines count as for another store, of the same keyframes."""

@@ -127,8 +127,15 @@ class LineRays:
 
     def cost(self, turn: Array) -> Array:
         """Sum of log(1 + s^2) over all lines, s the least distance in half pixels; [...]."""
+        return self._cost(turn, _COMPARED)
+
+    def energy(self, turn: Array) -> float:
+        """The same with s in fifths of a pixel, the unit of the information of `Axes`."""
+        return float(self._cost(turn, _FAR))
+
+    def _cost(self, turn: Array, width: float) -> Array:
         least = np.abs(self.distances(turn)).min(axis=-1)
-        return np.asarray(np.log1p((least / _COMPARED) ** 2).sum(axis=-1))
+        return np.asarray(np.log1p((least / width) ** 2).sum(axis=-1))
 
     def axes(self, turn: Array) -> Axes:
         """What the lines say of a turn."""

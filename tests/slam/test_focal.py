@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -95,11 +96,28 @@ def test_what_lines_say_goes_by_the_focal_length_that_is_tried(bench):
     optimiser, graph, true = bench(wrong=1.08)
     tried, last = [], []
     intrinsics = optimiser.store.image_intrinsics
-    optimiser.upright.refit = lambda: tried.append(float(intrinsics[0] / true[0]))
+    optimiser.upright.refit = lambda: tried.append(float(intrinsics[0] / true[0])) or 0.0
     optimiser.upright.measure = lambda: last.append(float(intrinsics[0] / true[0]))
     found = refine_focal(optimiser, graph, PHASE, SOLVER, CameraConfig(focal_trust=0.0), known=True)
     assert tried == pytest.approx([1.08 * factor for factor, _ in found.tried], rel=1e-5)
     assert last == pytest.approx([1.08 * found.factor], rel=1e-5)
+
+
+@pytest.mark.parametrize(("count", "leads_to"), [(0.0, 1.0), (1e8, 1.03)])
+def test_what_lines_are_off_counts_in_the_search(bench, count, leads_to):
+    """Where they are off least at 1.03 times the true focal length."""
+    optimiser, graph, true = bench(wrong=1.08)
+    graph.target[:] += 0.1 * torch.randn(graph.target.shape, generator=torch.manual_seed(0))
+    intrinsics = optimiser.store.image_intrinsics
+
+    def refit():
+        return count * math.log(float(intrinsics[0] / true[0]) / 1.03) ** 2
+
+    optimiser.upright = SimpleNamespace(
+        holds=True, term=lambda *_: None, refit=refit, measure=lambda: None
+    )
+    found = refine_focal(optimiser, graph, PHASE, SOLVER, CameraConfig(focal_trust=0.0), known=True)
+    assert 1.08 * found.factor == pytest.approx(leads_to, abs=0.012)
 
 
 def test_a_right_focal_length_stays(bench):

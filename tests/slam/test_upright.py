@@ -57,7 +57,7 @@ def build():
         random = np.random.default_rng(0)
         found = [lines_of(pose, random) for pose in true] if lines is None else lines
         part = SimpleNamespace(line_segments=lambda number: found[number])
-        store = KeyframeStore(GRID, INTRINSICS)
+        store = KeyframeStore(GRID, INTRINSICS.clone())
         upright = Upright(
             store,
             part if known else SimpleNamespace(),
@@ -241,10 +241,23 @@ def test_axes_are_fitted_again_where_they_are_known(build):
     assert known.tolist() == [number != 5 for number in range(COUNT)]
 
 
+def test_lines_are_off_least_at_the_true_focal_length(build):
+    upright, store, append, _ = build(least_share=0.0)
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    off = []
+    for factor in (0.97, 0.99, 1.0, 1.01, 1.03):
+        store.image_intrinsics[:2] = factor * INTRINSICS[:2]
+        off.append(upright.refit())
+    assert off[0] > off[1] > off[2] < off[3] < off[4]
+    assert off[2] < 0.01 * off[1]
+
+
 def test_nothing_is_fitted_where_lines_do_not_count(build):
     upright, store, append, _ = build(lines=askew())
     for number in range(COUNT):
         append(number)
     upright.begin()
-    upright.refit()
+    assert upright.refit() == 0.0
     assert not bool(store["axes_information"].any())
