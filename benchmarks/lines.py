@@ -7,7 +7,8 @@ together, later ones are followed from the one before, as in a run, but without 
 a mask. Of each clip: pictures with enough lines, the share of the length of their lines that agrees
 with three directions at right angles (of a tenth and of half of the pictures it is less), and for
 pictures by that share how far they are turned from the true poses, after one turn of the whole
-clip, in degrees: the median, what nine of ten stay below, and the most.
+clip, in degrees: the median, what nine of ten stay below, and the most. Then the focal length at
+which lines are off least, as a factor of the true one, and what looking for axes takes per picture.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from droidw.solve.manhattan import Axes, LineRays, axes_in_turn, next_axes
 from droidw_plugins.correspondence._flow_lines import line_segments
 
 SHARES = (0.0, 0.6, 0.75, 0.9, 1.01)
+FACTORS = 1.0 + np.array([-0.06, -0.04, -0.03, -0.02, -0.01, 0.0, 0.01, 0.02, 0.03, 0.04, 0.06])
 
 
 def followed(pictures: list[LineRays], first: int) -> list[Axes | None]:
@@ -54,12 +56,32 @@ def turned_by(turns: np.ndarray, true: np.ndarray) -> np.ndarray:
     return off
 
 
+def best_focal(
+    segments: list[np.ndarray], found: list[Axes | None], pinhole: Sequence[float], least: float
+) -> float:
+    """Factor of the focal length at which lines of pictures with this share are off least."""
+    fx, fy, cx, cy = pinhole
+    energies = []
+    for factor in FACTORS:
+        energy = 0.0
+        for lines, axes in zip(segments, found, strict=True):
+            if axes is not None and axes.share >= least:
+                rays = LineRays(lines, (factor * fx, factor * fy, cx, cy))
+                energy += rays.energy(rays.fitted(axes.turn))
+        energies.append(energy)
+    at = min(max(int(np.argmin(energies)), 1), len(FACTORS) - 2)
+    around = slice(at - 1, at + 2)
+    a, b, _ = np.polyfit(FACTORS[around], energies[around], 2)
+    return float(-b / (2 * a)) if a > 0 else float("nan")
+
+
 def measure(folder: Path, size: tuple[int, int], every: int, first: int) -> str:
     """One row of the table."""
     clip = read_clip(folder, size)
     began = time.perf_counter()
     greys = [cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY) for rgb in clip.pictures[::every]]
-    pictures = [LineRays(line_segments(grey), clip.pinhole) for grey in greys]
+    segments = [line_segments(grey) for grey in greys]
+    pictures = [LineRays(lines, clip.pinhole) for lines in segments]
     found = followed(pictures, first)
     took = (time.perf_counter() - began) / len(pictures)
     T_wc = torch.from_numpy(np.asarray(clip.poses[::every], np.float64))
@@ -76,6 +98,7 @@ def measure(folder: Path, size: tuple[int, int], every: int, first: int) -> str:
             figures = np.median(inside), np.percentile(inside, 90), inside.max()
             text = f"{len(inside)}: " + ", ".join(f"{figure:.2f}" for figure in figures)
         row.append(text)
+    row.append(f"{best_focal(segments, found, clip.pinhole, SHARES[1]):.3f}")
     return "| " + " | ".join([*row, f"{1000 * took:.0f}"]) + " |"
 
 
@@ -88,8 +111,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--size", default="320x240", help="width and height of the pictures")
     asked = parser.parse_args(argv)
     width, height = (int(part) for part in asked.size.split("x"))
-    print("| clip | pictures | share | below 0.6 | to 0.75 | to 0.9 | above | ms |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| clip | pictures | share | below 0.6 | to 0.75 | to 0.9 | above | focal | ms |")
+    print("|---|---|---|---|---|---|---|---|---|")
     for folder in asked.clips:
         print(measure(folder, (width, height), asked.every, asked.first), flush=True)
 
