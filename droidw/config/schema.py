@@ -106,6 +106,7 @@ class SolverConfig:
 
     lm: float = opt(1e-4, "relative damping of the reduced system", ge=0)
     ep: float = opt(0.1, "absolute damping of the reduced system", ge=0)
+    depth_damping: float = opt(1.0, "factor on the damping of depths (`weighting`)", ge=0)
     huber: float = opt(0.2, "Huber threshold in grid cells (0: quadratic)", ge=0)
     cauchy: float = opt(
         0.0, "residual in grid cells at which a Cauchy kernel halves a weight (0: none)", ge=0
@@ -382,7 +383,7 @@ class DroidwConfig:
     solver: SolverConfig = field(default_factory=lambda: SolverConfig(cauchy=0.15, cauchy_slip=1.0))
     global_solver: SolverConfig = field(
         default_factory=lambda: SolverConfig(
-            lm=1e-6, ep=1e-4, cauchy=0.75, cauchy_tuning=5.0, cauchy_slip=2.0
+            lm=1e-6, ep=1e-4, depth_damping=0.01, cauchy=0.75, cauchy_tuning=5.0, cauchy_slip=2.0
         )
     )
     filler_solver: SolverConfig = field(

@@ -255,6 +255,7 @@ class Optimiser:
         )
         count = len(store) - low
         fixed = torch.arange(count, device=store.device) < first_free - low
+        damping = weighting.damping_scale * store["damping"][low:] + weighting.damping_floor
         problem = BAProblem(
             T_cw=store.T_cw[low:],
             disps=store.disps[low:],
@@ -264,7 +265,7 @@ class Optimiser:
             target=target,
             weight=weight,
             fixed=fixed,
-            damping=weighting.damping_scale * store["damping"][low:] + weighting.damping_floor,
+            damping=solver.depth_damping * damping,
             prior=store["prior"][low:] if phase.depth_prior else None,
             prior_weight=weighting.prior_weight,
             lm=solver.lm,

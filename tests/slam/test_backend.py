@@ -210,3 +210,33 @@ def test_near_keyframes_keep_their_edges(broken):
     assert three_apart <= edges["diamond"]
     assert len(three_apart & edges["square"]) < len(three_apart) / 2
     assert len(edges["diamond"]) < COUNT * (COUNT - 1) / 2  # far ones are still thinned
+
+
+def test_cells_that_say_little_do_not_hold_on_to_the_scale_of_a_piece(arc, waves, stored):
+    """Half of the path is a tenth too large; damped as in the window, depths would keep it so."""
+    grid, intrinsics = Grid(H, W, 8, 3.5), torch.tensor([82.0, 82.0, 47.5, 31.5])
+    T_cw, disps, half = arc(COUNT), waves(COUNT, H, W), COUNT // 2
+    graph = FactorGraph(H, W, torch.device("cpu"))
+    graph.add([(i, j) for i in range(COUNT) for j in range(COUNT) if 0 < abs(i - j) < 4])
+    ii, jj = graph.index(graph.select())
+    graph.target[:], valid = reproject(T_cw, disps, grid.intrinsics(intrinsics), ii, jj)
+    graph.confidence[:] = 0.003 * valid[..., None].float()
+    centres = inv(T_cw)
+    centres[half:, :3] = centres[half, :3] + 1.1 * (centres[half:, :3] - centres[half, :3])
+    larger = torch.where(torch.arange(COUNT)[:, None, None] > half, disps / 1.1, disps)
+
+    def off(T):
+        c = inv(T)[:, :3]
+        return float((c[-1] - c[half]).norm() / (c[half] - c[0]).norm())
+
+    left = []
+    for depth_damping in (1.0, DroidwConfig().global_solver.depth_damping):
+        store = stored(grid, intrinsics.clone(), inv(centres), larger)
+        parts = Parts(None, None, None, TorchBundleAdjuster(), None)
+        config = DroidwConfig()
+        solver = replace(config.global_solver, cauchy=0.0, depth_damping=depth_damping)
+        optimiser = Optimiser(store, parts, config.weighting, Stopwatch())
+        optimiser.adjust(graph, graph.select(), config.schedule["global"], solver, first_free=1)
+        left.append((off(store.T_cw) / off(T_cw) - 1) / 0.1)
+    assert left[0] > 0.3
+    assert abs(left[1]) < 0.05
