@@ -113,12 +113,15 @@ class Backend:
         """The solver of one pass; its kernel narrows from pass to pass.
 
         One that follows the median residual is too narrow to mend what has broken off, as long as
-        most of the path is sound. So the last passes alone have it.
+        most of the path is sound. So the last passes alone have it. And they alone let depths go
+        that say little: under a wide kernel wrong matches would carry them off.
         """
         solver, last = self.config.global_solver, len(self.config.backend.passes) - 1
         if wide and number == 0:
             return self._wider(self.config.backend.wide_start)
-        return replace(solver, cauchy_tuning=0.0) if number == int(wide) < last else solver
+        if number == int(wide) < last:
+            return replace(solver, cauchy_tuning=0.0, depth_damping=1.0)
+        return solver
 
     def _prior(self, number: int) -> float:
         """How much steady motion counts in one pass; measurements have the last word."""
@@ -154,7 +157,8 @@ class Backend:
     def _wider(self, times: float) -> SolverConfig:
         """The solver with a kernel so many times as wide, whatever the residuals."""
         solver = self.config.global_solver
-        return replace(solver, cauchy=times * solver.cauchy, cauchy_tuning=0.0)
+        cauchy = times * solver.cauchy
+        return replace(solver, cauchy=cauchy, cauchy_tuning=0.0, depth_damping=1.0)
 
     def edges(self) -> list[tuple[int, int]]:
         """Directed edges between keyframes, chosen by how far they are apart now."""

@@ -109,8 +109,9 @@ def refine_focal(
     start = store.T_cw.clone(), store.disps.clone()
     rows = graph.select()
     steps = replace(phase, iterations=_STEPS, learn=False)
-    # Weights that change with the residuals would make each energy a sum of other weights.
-    solver = replace(solver, cauchy=0.0)
+    # Weights that change with the residuals would make each energy a sum of other weights. Without
+    # them wrong matches pull, so depths that say little stay.
+    solver = replace(solver, cauchy=0.0, depth_damping=1.0)
 
     def place(x: float) -> None:
         factor = math.exp(x)
