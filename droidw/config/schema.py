@@ -323,6 +323,9 @@ class LinesConfig:
         ge=0,
         le=1,
     )
+    doubt: float = opt(
+        0.75, "factor on `backwards_below`, `restart_below`, `again_below` where lines count", ge=0
+    )
 
 
 @dataclass

@@ -74,7 +74,7 @@ def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden | None
         Where uncertainty leaves less than half; None where there is no doubt, or hardly anything
         to hide. The user's masks are not in it: they hold anyway.
     """
-    if not doubtful(outcome.diagnosis.agreement, below):
+    if not doubtful(outcome.diagnosis.agreement, system.optimiser.upright.doubt(below)):
         return None
     store, grid = system.store, system.grid
     size = (system.camera.width, system.camera.height)

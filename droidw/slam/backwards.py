@@ -50,11 +50,12 @@ def doubted(
 ) -> Diagnosis:
     """Where too little of what a run measured agrees, let it have what a second look finds better.
 
-    Where not quite too little agrees, pieces that points contradict set out anew first: a path in
-    the wrong valley agrees with itself, so it is the one they leave that is to be judged. Then the
-    way there is adjusted once more, by the measurements that doubt asks for. The way back
-    is kept if more of what it measures agrees, then pieces of the way that agrees less in which it
-    agrees more; with what is kept uncertainty goes on learning. What fails is left out.
+    What is too little is less where lines hold the path (`Upright.doubt`). Where not quite too
+    little agrees, pieces that points contradict set out anew first: a path in the wrong valley
+    agrees with itself, so it is the one they leave that is to be judged. Then the way there is
+    adjusted once more, by the measurements that doubt asks for. The way back is kept if more of
+    what it measures agrees, then pieces of the way that agrees less in which it agrees more; with
+    what is kept uncertainty goes on learning. What fails is left out.
 
     Args:
         optimiser: of the run; poses, depths and uncertainty of its store may change.
@@ -64,8 +65,11 @@ def doubted(
         What to say of what is kept.
     """
     options = config.backend
-    in_doubt = doubtful(found.agreement, options.backwards_below)
-    if not in_doubt and not doubtful(found.agreement, options.restart_below):
+    below = optimiser.upright.doubt(options.backwards_below)
+    in_doubt = doubtful(found.agreement, below)
+    if not in_doubt and not doubtful(
+        found.agreement, optimiser.upright.doubt(options.restart_below)
+    ):
         return found
     look = _SecondLook(optimiser, config, found.agreement, events, stopped)
     optimiser.doubtful = True
@@ -73,7 +77,7 @@ def doubted(
         with optimiser.clock("backwards"):
             if not in_doubt:
                 look.set_out_anew()
-            if doubtful(look.kept.agreement, options.backwards_below):
+            if doubtful(look.kept.agreement, below):
                 _log.info(
                     "%.0f %% of what was measured agrees with poses and depths: tracking the "
                     "keyframes backwards (backend.backwards_below=0 does not)",
@@ -239,7 +243,8 @@ class _SecondLook:
         # What agrees with new weights is nothing to compare with what agreed before.
         agreement = self.kept.agreement
         # Footage that is to be tracked once more needs masks for that, and no better path.
-        again = doubtful(agreement, self.config.frontend.again_below)
+        below = self.optimiser.upright.doubt(self.config.frontend.again_below)
+        again = doubtful(agreement, below)
         last = self.kept
         for turn in range(1 if again else options.turns):
             # What moves is known better with every turn, and so are the points on it.

@@ -66,6 +66,7 @@ class Upright:
         self._find = getattr(correspondence, "line_segments", None)
         self._weight = 0.0 if options is None else options.weight
         self._least_share = 0.0 if options is None else options.least_share
+        self._doubt = 1.0 if options is None else options.doubt
         self._gates = gates
         self._clock = clock
         asked = self._find is not None and self._weight > 0
@@ -158,6 +159,13 @@ class Upright:
     def like(self, other: Upright) -> None:
         """Let lines count as for another store, of the same keyframes."""
         self.holds = other.holds
+
+    def doubt(self, below: float) -> float:
+        """The agreement below which a run is in doubt, where it is `below` without lines.
+
+        1, which doubts all, stays.
+        """
+        return below * self._doubt if self.holds and below < 1.0 else below
 
     def turn(self, number: int, still: bool = False) -> None:
         """Turn a keyframe about its centre as its lines say, where they do.

@@ -20,6 +20,8 @@ FLOW = (
     # each step lets the rounding of a path without parallax grow, and a second look has many
     "schedule.global.iterations=4",
     "backend.backwards_below=0",
+    # nor do its depths, let go
+    "global_solver.depth_damping=1",
     # softened, its pictures hold a path even less
     "correspondence.options.blur=0",
 )

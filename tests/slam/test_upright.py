@@ -189,6 +189,19 @@ def test_where_lines_are_not_asked_nothing_happens(build, how):
     assert upright.term(store.T_cw, 0, 1.0) is None
 
 
+def test_less_is_doubted_where_lines_count(build):
+    upright, _store, append, _ = build()
+    for number in range(COUNT):
+        append(number)
+    assert upright.doubt(0.7) == 0.7
+    upright.begin()
+    assert upright.doubt(0.7) == pytest.approx(0.7 * LinesConfig().doubt)
+    assert upright.doubt(0.0) == 0.0
+    assert upright.doubt(1.0) == 1.0
+    upright.holds = False
+    assert upright.doubt(0.7) == 0.7
+
+
 def test_few_keyframes_without_lines_decide_against(build):
     upright, _store, append, _ = build(lines=[np.zeros((0, 4))] * COUNT)
     append(0)
