@@ -47,9 +47,18 @@ def first():
         store=Store(SimpleNamespace(index=index) for index in (4, 7, 9)),
         grid=Grid(12, 16, 8, 3.5),
         camera=SimpleNamespace(width=128, height=96),
-        optimiser=SimpleNamespace(learned_gates=lambda nodes: gates[list(nodes)]),
+        optimiser=SimpleNamespace(
+            learned_gates=lambda nodes: gates[list(nodes)],
+            upright=SimpleNamespace(doubt=lambda below: below),
+        ),
         gates=gates,
     )
+
+
+def test_less_is_doubted_where_lines_count(first):
+    first.optimiser.upright.doubt = lambda below: 0.5 * below
+    assert to_hide(first, outcome(0.4), below=0.7) is None
+    assert to_hide(first, outcome(0.3), below=0.7)
 
 
 def test_what_uncertainty_closes_is_hidden(first):
