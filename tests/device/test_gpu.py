@@ -11,7 +11,14 @@ from droidw.slam.system import SlamSystem
 
 pytestmark = pytest.mark.gpu
 
-FLOW = ("--preset", "cpu", "frontend.predict=velocity")
+FLOW = (
+    "--preset",
+    "cpu",
+    "frontend.predict=velocity",
+    # of a clip next to without parallax rounding decides what is kept, and where depths go
+    "backend.backwards_below=0",
+    "global_solver.depth_damping=1",
+)
 DROID = ("--preset", "droid-slam",
          "correspondence.options={precision: float32, store: float}")  # fmt: skip
 SMALL = "depth={name: metric3d, options: {variant: vit-small, size: [56, 84], precision: float32}}"

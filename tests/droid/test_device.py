@@ -53,7 +53,15 @@ def test_another_device(make_state, monkeypatch, purpose, correlation):
         assert fine.shape == (64, 96) and fine.device == device
 
 
+@pytest.fixture
+def exact(monkeypatch):
+    """No TF32, as in a run (`droidw.run.machine.settle`); torch lets convolutions have it."""
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    monkeypatch.setattr(torch.backends.cuda.matmul, "allow_tf32", False)
+
+
 @pytest.mark.gpu
+@pytest.mark.usefixtures("exact")
 @pytest.mark.parametrize(("precision", "limit"), [("float32", 1e-3), ("auto", 5e-2)])
 def test_a_gpu_gives_the_numbers_of_the_cpu(make_state, device, precision, limit):
     answers = []
