@@ -7,6 +7,9 @@ moved at least over the measured speed of memory, and the operations over the me
 matrix product (float32).
 
     python benchmarks/ba.py [--threads 1] [--repeats 9] [--most 1000] [--quick] [--save]
+                            [--only "torch GPU,cuda"]
+
+`--save` writes after every window, so that nothing measured is lost where the time runs out.
 """
 
 from __future__ import annotations
@@ -63,38 +66,49 @@ def main() -> None:
         "--cross", action="store_true", help="weights with an off-diagonal: three channels"
     )
     parser.add_argument("--quick", action="store_true", help="the smallest window only")
-    parser.add_argument("--save", action="store_true", help="write results/ba.json and ba.md")
+    parser.add_argument("--only", default="", help="these backends: " + ", ".join(BACKENDS))
+    parser.add_argument(
+        "--save", action="store_true", help="write results/ba.json and ba.md (ba_cuda with a GPU)"
+    )
     parser.add_argument("--memory-of", nargs=5, help=argparse.SUPPRESS)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     if args.memory_of:
         sys.stdout.write(json.dumps(memory_of(*args.memory_of)))
         return
-    built = {name: made for name in BACKENDS if (made := build(name)) is not None}
+    wanted = [name.strip() for name in args.only.split(",") if name.strip()] or list(BACKENDS)
+    if unknown := set(wanted) - set(BACKENDS):
+        parser.error(f"--only: no backend {sorted(unknown)}; there are {', '.join(BACKENDS)}")
+    built = {name: made for name in wanted if (made := build(name)) is not None}
     speeds = {device: ceilings(device) for device in {BACKENDS[name][1] for name in built}}
     windows = [w for w in WINDOWS if w[0] <= args.most][: 1 if args.quick else None]
-    rows = []
-    for h, w in GRIDS[:1] if args.quick else GRIDS:
-        for keyframes, edges in windows:
-            problem = window(keyframes, edges, h, w, args.huber, args.cross)
-            row = measure(built, speeds, problem, args.repeats)
-            rows.append(row)
-            print(line(row), flush=True)
-    record = {
+    record: dict[str, Any] = {
         "benchmark": "ba",
         "machine": facts(args.threads),
         "repeats": args.repeats,
         "huber": args.huber,
         "cross": args.cross,
         "ceilings": speeds,
-        "rows": rows,
+        "rows": [],
     }
-    text = table(record)
-    print(text)
-    if args.save:
-        RESULTS.mkdir(exist_ok=True)
-        (RESULTS / "ba.json").write_text(json.dumps(record, indent=2) + "\n")
-        (RESULTS / "ba.md").write_text(text)
+    for h, w in GRIDS[:1] if args.quick else GRIDS:
+        for keyframes, edges in windows:
+            problem = window(keyframes, edges, h, w, args.huber, args.cross)
+            row = measure(built, speeds, problem, args.repeats)
+            record["rows"].append(row)
+            record["machine"]["load"] = os.getloadavg()[0]
+            print(line(row), flush=True)
+            if args.save:
+                save(record)
+    print(table(record))
+
+
+def save(record: dict[str, Any]) -> None:
+    """Keep what is measured so far in `results/`."""
+    RESULTS.mkdir(exist_ok=True)
+    name = "ba" if record["machine"]["gpu"] == "none" else "ba_cuda"
+    (RESULTS / f"{name}.json").write_text(json.dumps(record, indent=2) + "\n")
+    (RESULTS / f"{name}.md").write_text(table(record))
 
 
 def build(name: str) -> BundleAdjuster | None:
@@ -145,7 +159,7 @@ def measure(
             spent = timed(adjuster, problems[BACKENDS[name][1]])
             if turn:  # the first call warms up
                 times[name].append(spent)
-    counted = work(problems["cpu"])
+    counted = work(problem)
     row: dict[str, Any] = {
         "keyframes": keyframes, "edges": edges, "grid": f"{h}x{w}", **counted, "backends": {}
     }  # fmt: skip
