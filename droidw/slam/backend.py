@@ -37,6 +37,7 @@ class Backend:
     Args:
         focal_known: the focal length is a calibration, not a guess.
         motion_prior: how much steady motion counts in the first pass, as `backend.motion_prior`.
+        learn: uncertainty learns in the last passes, as `backend.learn`.
     Attributes:
         focal: what the search for a better focal length found, None without one.
         agreement: share of what was measured last that agrees with poses and depths; NaN before.
@@ -48,11 +49,13 @@ class Backend:
         config: DroidwConfig,
         focal_known: bool = True,
         motion_prior: float = 0.0,
+        learn: bool = False,
     ) -> None:
         self.optimiser = optimiser
         self.config = config
         self.focal_known = focal_known
         self.motion_prior = motion_prior
+        self.learn = learn
         self.focal: FocalSearch | None = None
         self.agreement = float("nan")
 
@@ -67,12 +70,15 @@ class Backend:
         options, store = self.config.backend, self.optimiser.store
         if len(store) < 3:
             return 0
-        phase = self.config.schedule["global"]
+        row = self.config.schedule["global"]
         total = sum(options.passes)
         done = edges = 0
         wide = self._begins_wide()
         for number, updates in enumerate(options.passes):
             solver, prior = self._solver(number, wide), self._prior(number)
+            # What was learned while the path was off in scale closes what stands still.
+            settled = solver is self.config.global_solver
+            phase = replace(row, learn=row.learn or (self.learn and settled))
             if options.normalize and not bool(store["prior"].any()):
                 mean = store.disps.mean()
                 store.disps.div_(mean)
@@ -93,8 +99,8 @@ class Backend:
                 done += 1
                 tell(done, total)
             edges = len(graph)
-            settled = number == int(wide)
-            if settled and self.config.camera.refine_focal and len(store) >= MIN_KEYFRAMES:
+            refine = self.config.camera.refine_focal and number == int(wide)
+            if refine and len(store) >= MIN_KEYFRAMES:
                 self.focal = refine_focal(
                     self.optimiser,
                     graph,

@@ -289,7 +289,8 @@ class SlamSystem:
         elif not brief:
             with self.clock("global"):
                 self.optimiser.upright.again()
-                backend = Backend(self.optimiser, self.config, self._focal_known)
+                learn = self.config.backend.learn
+                backend = Backend(self.optimiser, self.config, self._focal_known, learn=learn)
                 backend.run(lambda done, total: self.events.emit(Progress("global", done, total)))
                 self._refined(backend.focal)
                 found = replace(found, agreement=backend.agreement)

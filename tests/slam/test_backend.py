@@ -201,6 +201,32 @@ def test_the_focal_length_is_looked_for_after_the_first_pass_that_is_not_wide(
     assert told.index("focal") == updates
 
 
+@pytest.mark.parametrize(
+    ("learn", "in_all", "options", "expected"),
+    [
+        (True, False, {}, [False, False, True, True]),  # neither wide nor before the focal length
+        (True, False, {"wide_start": 1.0}, [False, True, True, True]),
+        (True, False, {"passes": [1]}, [True]),
+        (True, True, {}, [True] * 4),
+        (False, False, {}, [False] * 4),
+    ],
+)
+def test_uncertainty_learns_when_the_path_is_mended(
+    broken, monkeypatch, learn, in_all, options, expected
+):
+    backend, _ = broken(**{"passes": [1, 1, 1, 1], **options})
+    backend.config.schedule["global"].learn = in_all
+    backend.learn = learn
+    heard = []
+    monkeypatch.setattr(
+        backend.optimiser,
+        "update",
+        lambda graph, session, phase, solver, **more: heard.append(phase.learn),
+    )
+    run(backend)
+    assert heard == expected
+
+
 def test_near_keyframes_keep_their_edges(broken):
     edges = {}
     for shape in ("square", "diamond"):
