@@ -239,7 +239,7 @@ class BackendConfig:
         "many matches with a usual residual (0: not at all)",
         ge=0,
     )
-    learn: bool = opt(True, "let uncertainty learn in the last passes, when the path is mended")
+    learn: bool = opt(True, "let uncertainty learn anew in the last passes, from a mended path")
     relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
     turns: int = opt(
         3,

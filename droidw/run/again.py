@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from droidw.geometry.spread import closed
-from droidw.slam.doubt import doubtful
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,7 +73,7 @@ def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden | None
         Where uncertainty leaves less than half; None where there is no doubt, or hardly anything
         to hide. The user's masks are not in it: they hold anyway.
     """
-    if not doubtful(outcome.diagnosis.agreement, system.optimiser.upright.doubt(below)):
+    if not system.optimiser.upright.doubts(outcome.diagnosis.agreement, below):
         return None
     store, grid = system.store, system.grid
     size = (system.camera.width, system.camera.height)

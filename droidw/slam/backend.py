@@ -37,7 +37,7 @@ class Backend:
     Args:
         focal_known: the focal length is a calibration, not a guess.
         motion_prior: how much steady motion counts in the first pass, as `backend.motion_prior`.
-        learn: uncertainty learns in the last passes, as `backend.learn`.
+        learn: uncertainty learns anew in the last passes, as `backend.learn`.
     Attributes:
         focal: what the search for a better focal length found, None without one.
         agreement: share of what was measured last that agrees with poses and depths; NaN before.
@@ -73,12 +73,15 @@ class Backend:
         row = self.config.schedule["global"]
         total = sum(options.passes)
         done = edges = 0
-        wide = self._begins_wide()
+        wide, begun = self._begins_wide(), False
         for number, updates in enumerate(options.passes):
             solver, prior = self._solver(number, wide), self._prior(number)
-            # What was learned while the path was off in scale closes what stands still.
-            settled = solver is self.config.global_solver
-            phase = replace(row, learn=row.learn or (self.learn and settled))
+            learns = self.learn and solver is self.config.global_solver
+            if learns and self.optimiser.begun and not begun:
+                # What was learned while the path was off in scale closes what stands still.
+                self.optimiser.begin()
+                begun = True
+            phase = replace(row, learn=row.learn or learns)
             if options.normalize and not bool(store["prior"].any()):
                 mean = store.disps.mean()
                 store.disps.div_(mean)

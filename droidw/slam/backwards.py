@@ -17,7 +17,6 @@ import torch
 
 from droidw.events import Dispatcher, Progress
 from droidw.slam.backend import Backend
-from droidw.slam.doubt import doubtful
 from droidw.slam.frontend import Frontend
 from droidw.slam.optimise import Optimiser
 from droidw.slam.path import Path
@@ -64,12 +63,9 @@ def doubted(
     Returns:
         What to say of what is kept.
     """
-    options = config.backend
-    below = optimiser.upright.doubt(options.backwards_below)
-    in_doubt = doubtful(found.agreement, below)
-    if not in_doubt and not doubtful(
-        found.agreement, optimiser.upright.doubt(options.restart_below)
-    ):
+    options, doubts = config.backend, optimiser.upright.doubts
+    in_doubt = doubts(found.agreement, options.backwards_below)
+    if not in_doubt and not doubts(found.agreement, options.restart_below):
         return found
     look = _SecondLook(optimiser, config, found.agreement, events, stopped)
     optimiser.doubtful = True
@@ -77,7 +73,7 @@ def doubted(
         with optimiser.clock("backwards"):
             if not in_doubt:
                 look.set_out_anew()
-            if doubtful(look.kept.agreement, below):
+            if doubts(look.kept.agreement, options.backwards_below):
                 _log.info(
                     "%.0f %% of what was measured agrees with poses and depths: tracking the "
                     "keyframes backwards (backend.backwards_below=0 does not)",
@@ -243,8 +239,7 @@ class _SecondLook:
         # What agrees with new weights is nothing to compare with what agreed before.
         agreement = self.kept.agreement
         # Footage that is to be tracked once more needs masks for that, and no better path.
-        below = self.optimiser.upright.doubt(self.config.frontend.again_below)
-        again = doubtful(agreement, below)
+        again = self.optimiser.upright.doubts(agreement, self.config.frontend.again_below)
         last = self.kept
         for turn in range(1 if again else options.turns):
             # What moves is known better with every turn, and so are the points on it.

@@ -12,6 +12,7 @@ import torch
 
 from droidw.geometry.se3 import from_matrix, inv, rotation
 from droidw.geometry.transfer import upload
+from droidw.slam.doubt import doubtful
 from droidw.solve.manhattan import (
     Axes,
     LineRays,
@@ -160,12 +161,13 @@ class Upright:
         """Let lines count as for another store, of the same keyframes."""
         self.holds = other.holds
 
-    def doubt(self, below: float) -> float:
-        """The agreement below which a run is in doubt, where it is `below` without lines.
+    def doubts(self, agreement: float, below: float) -> bool:
+        """Whether a run is in doubt; `doubtful`, with less that has to agree where lines count.
 
-        1, which doubts all, stays.
+        Args:
+            agreement, below: as of `doubtful`, without lines.
         """
-        return below * self._doubt if self.holds and below < 1.0 else below
+        return doubtful(agreement, below * self._doubt if self.holds and below < 1.0 else below)
 
     def turn(self, number: int, still: bool = False) -> None:
         """Turn a keyframe about its centre as its lines say, where they do.

@@ -201,30 +201,33 @@ def test_the_focal_length_is_looked_for_after_the_first_pass_that_is_not_wide(
     assert told.index("focal") == updates
 
 
+@pytest.mark.parametrize("begun", [True, False])  # with what can move
 @pytest.mark.parametrize(
     ("learn", "in_all", "options", "expected"),
     [
-        (True, False, {}, [False, False, True, True]),  # neither wide nor before the focal length
-        (True, False, {"wide_start": 1.0}, [False, True, True, True]),
-        (True, False, {"passes": [1]}, [True]),
-        (True, True, {}, [True] * 4),
+        # neither in the wide pass nor in that before the focal length
+        (True, False, {}, [False, False, "anew", True, True]),
+        (True, False, {"wide_start": 1.0}, [False, "anew", True, True, True]),
+        (True, False, {"passes": [1]}, ["anew", True]),
+        (True, True, {}, [True, True, "anew", True, True]),
         (False, False, {}, [False] * 4),
     ],
 )
-def test_uncertainty_learns_when_the_path_is_mended(
-    broken, monkeypatch, learn, in_all, options, expected
+def test_uncertainty_learns_anew_when_the_path_is_mended(
+    broken, monkeypatch, learn, in_all, options, expected, begun
 ):
     backend, _ = broken(**{"passes": [1, 1, 1, 1], **options})
     backend.config.schedule["global"].learn = in_all
-    backend.learn = learn
+    backend.learn, backend.optimiser.begun = learn, begun
     heard = []
     monkeypatch.setattr(
         backend.optimiser,
         "update",
         lambda graph, session, phase, solver, **more: heard.append(phase.learn),
     )
+    monkeypatch.setattr(backend.optimiser, "begin", lambda: heard.append("anew"))
     run(backend)
-    assert heard == expected
+    assert heard == [told for told in expected if begun or told != "anew"]
 
 
 def test_near_keyframes_keep_their_edges(broken):

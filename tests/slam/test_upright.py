@@ -193,13 +193,14 @@ def test_less_is_doubted_where_lines_count(build):
     upright, _store, append, _ = build()
     for number in range(COUNT):
         append(number)
-    assert upright.doubt(0.7) == 0.7
+    below = 0.7 * LinesConfig().doubt
+    assert upright.doubts(0.69, 0.7) and not upright.doubts(0.71, 0.7)
     upright.begin()
-    assert upright.doubt(0.7) == pytest.approx(0.7 * LinesConfig().doubt)
-    assert upright.doubt(0.0) == 0.0
-    assert upright.doubt(1.0) == 1.0
+    assert upright.doubts(below - 0.01, 0.7) and not upright.doubts(below + 0.01, 0.7)
+    assert not upright.doubts(0.0, 0.0)
+    assert upright.doubts(0.99, 1.0) and upright.doubts(1.0, 1.0)
     upright.holds = False
-    assert upright.doubt(0.7) == 0.7
+    assert upright.doubts(0.69, 0.7)
 
 
 def test_few_keyframes_without_lines_decide_against(build):

@@ -18,6 +18,7 @@ from droidw.run.again import Hidden, rejection, second_time, to_hide
 from droidw.run.drive import _Run
 from droidw.slam.backend import Backend
 from droidw.slam.diagnosis import Diagnosis
+from droidw.slam.doubt import doubtful
 from droidw.slam.filler import Filler
 from droidw.slam.system import SlamSystem
 
@@ -49,14 +50,14 @@ def first():
         camera=SimpleNamespace(width=128, height=96),
         optimiser=SimpleNamespace(
             learned_gates=lambda nodes: gates[list(nodes)],
-            upright=SimpleNamespace(doubt=lambda below: below),
+            upright=SimpleNamespace(doubts=doubtful),
         ),
         gates=gates,
     )
 
 
 def test_less_is_doubted_where_lines_count(first):
-    first.optimiser.upright.doubt = lambda below: 0.5 * below
+    first.optimiser.upright.doubts = lambda agreement, below: agreement < 0.5 * below
     assert to_hide(first, outcome(0.4), below=0.7) is None
     assert to_hide(first, outcome(0.3), below=0.7)
 
