@@ -99,8 +99,9 @@ class UncertaintyModel(Protocol):
 
     A model may also have `begins`, true if it wants to know what can move before any motion is
     known. It then has a method `begin(view, movable)`, which writes `view.uncertainty` of
-    `view.frames`, the keyframes of the initialisation, from what the extractor's `movable` says of
-    them, [N,h,w]. It is called once, before the first search, and only with such an extractor.
+    `view.frames` from what the extractor's `movable` says of them, [N,h,w]. It is called before the
+    first search, with the keyframes of the initialisation, and again in global adjustment, with all
+    of them: what was learned by then is given up. Only with such an extractor.
     With `renews` it is told of every later keyframe, too: `renew(view, index, movable)`, with
     `movable` [h,w] of keyframe `index` and without edges, is called just before its `append` and
     writes no map.

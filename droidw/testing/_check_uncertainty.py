@@ -65,9 +65,17 @@ def _begin(subject: Subject) -> None:
         same(before.uncertainty[3], view.uncertainty[3]),
         "begin changed the map of a keyframe that is not in `frames`",
     )
+    began = view.uncertainty.clone()
     with subject.calling("update after begin"):
         part.update(view)
     _maps(subject, view, "after begin and an update")
+    with subject.calling("begin once more"):
+        part.begin(_without_edges(view), movable)
+    subject.expect(
+        "begins-anew",
+        same(began, view.uncertainty),
+        "begin, called once more, kept something of what was learned in between",
+    )
 
 
 def _renew(subject: Subject) -> None:
