@@ -198,8 +198,7 @@ class BackendConfig:
     radius: int = opt(1, "neighbours always linked", ge=1)
     nms: int = opt(3, "suppression radius around chosen edges", ge=0)
     nms_shape: Literal["square", "diamond"] = opt(
-        "diamond",
-        "what a chosen edge suppresses; diamond: as in the window, little near the diagonal",
+        "diamond", "what a chosen edge suppresses; diamond: little near the diagonal"
     )
     normalize: bool = opt(
         False, "bring the mean disparity to 1 before each pass, where no depth prior is"
@@ -289,6 +288,9 @@ class WeightingConfig:
     )
     slope: float = opt(45.0, "slope of the rational gate", gt=0)
     shift: float = opt(35.0, "shift of the rational gate", ge=0)
+    otsu: bool = opt(
+        True, "after `backend.learn` half closed where values part best in two (Otsu), if later"
+    )
     floor: float = opt(0.1, "smallest denominator of the rational gate", gt=0)
     open_share: float = opt(
         0.5,
@@ -333,9 +335,7 @@ class LinesConfig:
 class CloudConfig:
     """Which depths count as seen consistently, and go into the static cloud."""
 
-    relative_threshold: float = opt(
-        0.02, "largest relative depth disagreement with a neighbour", gt=0
-    )
+    relative_threshold: float = opt(0.02, "largest relative disagreement with a neighbour", gt=0)
     min_views: int = opt(2, "neighbouring keyframes that must agree", ge=0)
     min_weight: float = opt(0.5, "smallest uncertainty weight of a static point", ge=0, le=1)
     far: float = opt(4.0, "depths beyond this many times the median are left out (0: keep)", ge=0)

@@ -73,14 +73,13 @@ class Backend:
         row = self.config.schedule["global"]
         total = sum(options.passes)
         done = edges = 0
-        wide, begun = self._begins_wide(), False
+        wide, anew = self._begins_wide(), False
         for number, updates in enumerate(options.passes):
             solver, prior = self._solver(number, wide), self._prior(number)
             learns = self.learn and solver is self.config.global_solver
-            if learns and self.optimiser.begun and not begun:
-                # What was learned while the path was off in scale closes what stands still.
-                self.optimiser.begin()
-                begun = True
+            if learns and not anew:
+                self.optimiser.begin_anew()
+                anew = True
             phase = replace(row, learn=row.learn or learns)
             if options.normalize and not bool(store["prior"].any()):
                 mean = store.disps.mean()

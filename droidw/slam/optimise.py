@@ -21,7 +21,7 @@ from droidw.solve.epipolar import PointMatches, epipolar_term
 from droidw.solve.kernel import redescended, usual_square
 from droidw.solve.motion import steady_motion
 from droidw.solve.problem import BAProblem, PoseTerm, Report
-from droidw.solve.weights import gate, opened, residual_weights
+from droidw.solve.weights import gate, half_open, opened, parting, residual_weights
 
 if TYPE_CHECKING:
     from droidw.config.schema import LinesConfig, PhaseConfig, SolverConfig, WeightingConfig
@@ -60,6 +60,10 @@ class _Edges:
     pairs: list[tuple[int, int]]
 
 
+# The gate closes so many times later at most: one of two movers may look more like what stands.
+_LATEST = 1.6
+
+
 class Optimiser:
     """Alternates the parts over a factor graph as a phase of the schedule says.
 
@@ -72,6 +76,7 @@ class Optimiser:
         lines: how much lines in the pictures count; None: not at all.
     Attributes:
         begins: uncertainty is to be told what can move before the first search. begun: it was.
+        anew: it has learned anew, from a path that was mended.
         doubtful: correspondence is asked on behalf of a path that is in doubt.
         points: matched between keyframes of the store, and how much they count in steps that all
             keyframes have a part in: a fifth of a pixel off its epipolar line, a point counts as
@@ -105,7 +110,8 @@ class Optimiser:
         self.begins = getattr(parts.uncertainty, "begins", False) and hasattr(
             parts.features, "movable"
         )
-        self.begun = False
+        self.begun = self.anew = False
+        self._later = 1.0
         self.doubtful = False
         self.points: tuple[PointMatches, float] | None = None
         self.iterations = 0
@@ -119,7 +125,7 @@ class Optimiser:
             store, self.parts, self.weighting, self.clock, self._published, self._lines
         )
         other.upright.like(self.upright)
-        other.begun = self.begun
+        other.begun, other.anew, other._later = self.begun, self.anew, self._later
         other.doubtful = self.doubtful
         return other
 
@@ -136,6 +142,17 @@ class Optimiser:
             with self.clock("uncertainty"):
                 self.parts.uncertainty.begin(view, self.store["movable"])  # type: ignore[attr-defined]
             self.begun = True
+
+    def begin_anew(self) -> None:
+        """Let uncertainty start once more, by all keyframes, where it started with what can move.
+
+        What it learned while the path was off in scale closes what stands still. From here on the
+        gate goes by how uncertainty parts: movers stand out from what a right path teaches.
+        """
+        if self.begun:
+            self.begin()
+        self.anew = True
+        self._part()
 
     def measure(
         self,
@@ -320,8 +337,15 @@ class Optimiser:
 
     def _gate(self, u: Tensor) -> Tensor:
         w = self.weighting
-        u = opened(u, w.open_share, kind=w.gate, slope=w.slope, shift=w.shift)
+        u = opened(u / self._later, w.open_share, kind=w.gate, slope=w.slope, shift=w.shift)
         return gate(u, kind=w.gate, slope=w.slope, shift=w.shift, floor=w.floor)
+
+    def _part(self) -> None:
+        """Let the gate close where what was learned parts in two, if that is later."""
+        w = self.weighting
+        if self.anew and w.otsu:
+            half = half_open(w.gate, w.slope, w.shift)
+            self._later = min(max(parting(self.store["uncertainty"]) / half, 1.0), _LATEST)
 
     def view(
         self,
@@ -369,5 +393,6 @@ class Optimiser:
         frames = sorted({i for i, _ in pairs} | set(range(first_free, len(self.store))))
         report = self.parts.uncertainty.update(self.view(ii, jj, target, confidence, frames, pairs))
         self.iterations += 1
+        self._part()
         if not math.isfinite(report.energy):
             self.reports["uncertainty"] = self.reports.get("uncertainty", 0) + 1

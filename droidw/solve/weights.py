@@ -24,12 +24,18 @@ __all__ = [
     "agreeing_share",
     "agreeing_weight",
     "gate",
+    "half_open",
     "opened",
+    "parting",
     "residual_weights",
     "unmasked",
 ]
 
 GateKind = Literal["rational", "inverse", "none"]
+
+_BINS = 256
+# Smaller uncertainties are as good as this one: their logarithms would be all that parts.
+_LEAST_PARTED = 0.05
 
 
 def gate(
@@ -66,6 +72,38 @@ def gate(
     else:
         raise ValueError(f"no gate is called {kind!r}; valid: rational, inverse, none")
     return torch.where(torch.isfinite(u), weight, torch.zeros_like(weight))
+
+
+def half_open(kind: GateKind = "rational", slope: float = 45.0, shift: float = 35.0) -> float:
+    """The uncertainty that `gate` leaves half of its weight; infinite for "none"."""
+    if kind == "none":
+        return math.inf
+    return (2.0 + shift) / slope if kind == "rational" else 2.0
+
+
+def parting(u: Tensor) -> float:
+    """The uncertainty at which all of these part best in two (Otsu 1979, of their logarithms).
+
+    Args:
+        u: any shape, >= 0; what is not finite does not count.
+    Returns:
+        A value between the least and the largest; 0 where all are alike.
+    """
+    logs = u[torch.isfinite(u)].clamp_min(_LEAST_PARTED).log()
+    if not logs.numel():
+        return 0.0
+    low, high = (float(end) for end in logs.aminmax())
+    if low == high:
+        return 0.0
+    counts = torch.histc(logs, _BINS, low, high).double()
+    places = torch.arange(_BINS, dtype=torch.float64, device=u.device)
+    sums, below = (counts * places).cumsum(0), counts.cumsum(0)
+    # neither is empty: the least value is in the first bin and the largest in the last
+    first, second = below[:-1], below[-1] - below[:-1]
+    apart = first * second * ((sums[-1] - sums[:-1]) / second - sums[:-1] / first) ** 2
+    # an empty stretch parts the same anywhere: in its middle
+    best = float((apart >= (1 - 1e-9) * apart.max()).nonzero().double().mean())
+    return math.exp(low + (high - low) * (best + 1) / _BINS)
 
 
 def opened(

@@ -201,7 +201,6 @@ def test_the_focal_length_is_looked_for_after_the_first_pass_that_is_not_wide(
     assert told.index("focal") == updates
 
 
-@pytest.mark.parametrize("begun", [True, False])  # with what can move
 @pytest.mark.parametrize(
     ("learn", "in_all", "options", "expected"),
     [
@@ -214,20 +213,45 @@ def test_the_focal_length_is_looked_for_after_the_first_pass_that_is_not_wide(
     ],
 )
 def test_uncertainty_learns_anew_when_the_path_is_mended(
-    broken, monkeypatch, learn, in_all, options, expected, begun
+    broken, monkeypatch, learn, in_all, options, expected
 ):
     backend, _ = broken(**{"passes": [1, 1, 1, 1], **options})
     backend.config.schedule["global"].learn = in_all
-    backend.learn, backend.optimiser.begun = learn, begun
+    backend.learn = learn
     heard = []
     monkeypatch.setattr(
         backend.optimiser,
         "update",
         lambda graph, session, phase, solver, **more: heard.append(phase.learn),
     )
-    monkeypatch.setattr(backend.optimiser, "begin", lambda: heard.append("anew"))
+    monkeypatch.setattr(backend.optimiser, "begin_anew", lambda: heard.append("anew"))
     run(backend)
-    assert heard == [told for told in expected if begun or told != "anew"]
+    assert heard == expected
+
+
+@pytest.mark.parametrize("begun", [True, False])
+@pytest.mark.parametrize(
+    ("otsu", "moves", "expected"), [(True, 4.0, 1.0), (True, 0.6, 0.1), (False, 4.0, 0.1)]
+)
+def test_the_gate_goes_by_how_uncertainty_parts_once_it_learned_anew(
+    broken, monkeypatch, begun, otsu, moves, expected
+):
+    """Where movers stand out, what is in doubt (column 0) stays open; it starts anew if it did."""
+    backend, _ = broken()
+    optimiser, told = backend.optimiser, []
+    optimiser.begun, optimiser.weighting.otsu = begun, otsu
+    monkeypatch.setattr(optimiser, "begin", lambda: told.append("begin"))
+    u = torch.full((W,), 0.4)
+    u[0], u[1:4] = 1.0, moves
+    optimiser.store["uncertainty"][:] = u
+    assert optimiser.gates()[..., 0].unique() == pytest.approx(0.1)
+    optimiser.begin_anew()
+    assert told == (["begin"] if begun else [])
+    gates = optimiser.gates()
+    assert gates[..., 0].unique() == pytest.approx(expected)
+    assert gates[..., 4:].unique() == pytest.approx(1.0)
+    assert bool((gates[..., 1:4] < 0.1).all()) == (moves > 1)
+    assert torch.equal(optimiser.beside(optimiser.store).gates(), gates)
 
 
 def test_near_keyframes_keep_their_edges(broken):

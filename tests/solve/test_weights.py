@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
-from droidw.solve.weights import gate, opened, residual_weights, unmasked
+from droidw.solve.weights import gate, half_open, opened, parting, residual_weights, unmasked
 
 
 def test_rational_gate_matches_the_published_table() -> None:
@@ -128,3 +130,30 @@ def test_a_user_mask_reaches_the_cells_around_what_it_covers() -> None:
     expected[:2, :3] = 0.0
     expected[2:, 3:] = 0.75
     assert torch.equal(unmasked(covered), expected)
+
+
+def test_uncertainties_part_where_few_of_them_are():
+    g = torch.Generator().manual_seed(0)
+    stands = 0.6 * torch.exp(0.3 * torch.randn(900, generator=g))
+    moves = 3.0 * torch.exp(0.2 * torch.randn(100, generator=g))
+    u = torch.cat((stands, moves)).reshape(4, 10, 25)
+    t = parting(u)
+    assert (stands > t).float().mean() < 0.02
+    assert (moves < t).float().mean() < 0.02
+    bad = torch.cat((u.flatten(), torch.tensor([math.nan, math.inf, 0.0])))
+    assert parting(bad) == pytest.approx(t, rel=0.05)
+
+
+def test_an_empty_stretch_is_parted_in_its_middle():
+    assert parting(torch.tensor([0.5] * 6 + [2.0] * 2)) == pytest.approx(1.0, rel=0.01)
+
+
+@pytest.mark.parametrize("u", [torch.empty(0), torch.full((3, 4), 0.7), torch.zeros(5)])
+def test_what_is_alike_does_not_part(u):
+    assert parting(u) == 0.0
+
+
+@pytest.mark.parametrize("kind", ["rational", "inverse"])
+def test_half_of_the_gate(kind):
+    assert gate(torch.tensor(half_open(kind)), kind).item() == pytest.approx(0.5, abs=1e-5)
+    assert half_open("none") == math.inf
