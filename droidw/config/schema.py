@@ -288,8 +288,8 @@ class WeightingConfig:
     )
     slope: float = opt(45.0, "slope of the rational gate", gt=0)
     shift: float = opt(35.0, "shift of the rational gate", ge=0)
-    otsu: bool = opt(
-        True, "after `backend.learn` half closed where values part best in two (Otsu), if later"
+    parted: bool = opt(
+        True, "after `backend.learn` half closed where values part best in two, if later"
     )
     floor: float = opt(0.1, "smallest denominator of the rational gate", gt=0)
     open_share: float = opt(

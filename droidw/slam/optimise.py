@@ -61,7 +61,7 @@ class _Edges:
 
 
 # The gate closes so many times later at most: one of two movers may look more like what stands.
-_LATEST = 1.6
+_LATEST = 2.5
 
 
 class Optimiser:
@@ -343,7 +343,7 @@ class Optimiser:
     def _part(self) -> None:
         """Let the gate close where what was learned parts in two, if that is later."""
         w = self.weighting
-        if self.anew and w.otsu:
+        if self.anew and w.parted:
             half = half_open(w.gate, w.slope, w.shift)
             self._later = min(max(parting(self.store["uncertainty"]) / half, 1.0), _LATEST)
 

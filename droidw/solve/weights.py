@@ -34,6 +34,8 @@ __all__ = [
 GateKind = Literal["rational", "inverse", "none"]
 
 _BINS = 256
+# A part of two has at least so large a share; two say far more than one from so much less error on.
+_LEAST_PART, _FAR_MORE = 0.005, 0.25
 # Smaller uncertainties are as good as this one: their logarithms would be all that parts.
 _LEAST_PARTED = 0.05
 
@@ -82,7 +84,11 @@ def half_open(kind: GateKind = "rational", slope: float = 45.0, shift: float = 3
 
 
 def parting(u: Tensor) -> float:
-    """The uncertainty at which all of these part best in two (Otsu 1979, of their logarithms).
+    """The uncertainty at which all of these part best in two.
+
+    By the least error of two normal distributions of log u (Kittler and Illingworth 1986), which
+    allows for a few that are far off, if they say far more of log u than a single one; else by
+    the most variance between both parts (Otsu 1979).
 
     Args:
         u: any shape, >= 0; what is not finite does not count.
@@ -95,14 +101,23 @@ def parting(u: Tensor) -> float:
     low, high = (float(end) for end in logs.aminmax())
     if low == high:
         return 0.0
-    counts = torch.histc(logs, _BINS, low, high).double()
-    places = torch.arange(_BINS, dtype=torch.float64, device=u.device)
-    sums, below = (counts * places).cumsum(0), counts.cumsum(0)
-    # neither is empty: the least value is in the first bin and the largest in the last
-    first, second = below[:-1], below[-1] - below[:-1]
-    apart = first * second * ((sums[-1] - sums[:-1]) / second - sums[:-1] / first) ** 2
+    counts = torch.histc(logs, _BINS, low, high).double().cpu()
+    shares, places = counts / counts.sum(), torch.arange(_BINS, dtype=torch.float64)
+    first, sums, squares = ((shares * places**k).cumsum(0) for k in range(3))
+    # neither part is empty: the least value is in the first bin and the largest in the last
+    parts = [(m[:-1], m[-1] - m[:-1]) for m in (first, sums, squares)]
+    p, means = parts[0], [s / n for s, n in zip(parts[1], parts[0], strict=True)]
+    spread = [
+        (q / n - m**2).clamp_min(1 / 12)  # that of one bin
+        for q, n, m in zip(parts[2], p, means, strict=True)
+    ]
+    error = sum(n * (v.log() - 2 * n.log()) for n, v in zip(p, spread, strict=True))
+    error = torch.where(torch.minimum(*p) < _LEAST_PART, math.inf, error)
+    whole = math.log(max(float(squares[-1] - sums[-1] ** 2), 1 / 12))
+    apart = p[0] * p[1] * (means[1] - means[0]) ** 2
+    score = -error if float(error.min()) < whole - _FAR_MORE else apart
     # an empty stretch parts the same anywhere: in its middle
-    best = float((apart >= (1 - 1e-9) * apart.max()).nonzero().double().mean())
+    best = float((score >= score.max() - 1e-9 * score.max().abs()).nonzero().double().mean())
     return math.exp(low + (high - low) * (best + 1) / _BINS)
 
 

@@ -231,15 +231,15 @@ def test_uncertainty_learns_anew_when_the_path_is_mended(
 
 @pytest.mark.parametrize("begun", [True, False])
 @pytest.mark.parametrize(
-    ("otsu", "moves", "expected"), [(True, 4.0, 1.0), (True, 0.6, 0.1), (False, 4.0, 0.1)]
+    ("parted", "moves", "expected"), [(True, 4.0, 1.0), (True, 0.6, 0.1), (False, 4.0, 0.1)]
 )
 def test_the_gate_goes_by_how_uncertainty_parts_once_it_learned_anew(
-    broken, monkeypatch, begun, otsu, moves, expected
+    broken, monkeypatch, begun, parted, moves, expected
 ):
     """Where movers stand out, what is in doubt (column 0) stays open; it starts anew if it did."""
     backend, _ = broken()
     optimiser, told = backend.optimiser, []
-    optimiser.begun, optimiser.weighting.otsu = begun, otsu
+    optimiser.begun, optimiser.weighting.parted = begun, parted
     monkeypatch.setattr(optimiser, "begin", lambda: told.append("begin"))
     u = torch.full((W,), 0.4)
     u[0], u[1:4] = 1.0, moves

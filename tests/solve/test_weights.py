@@ -144,6 +144,14 @@ def test_uncertainties_part_where_few_of_them_are():
     assert parting(bad) == pytest.approx(t, rel=0.05)
 
 
+def test_a_few_that_are_far_off_do_not_part_the_others():
+    """By variance between parts alone the limit would be at 1.2, within what stands still."""
+    g = torch.Generator().manual_seed(0)
+    stands = 0.6 * torch.exp(0.4 * torch.randn(950, generator=g))
+    moves = 3.5 * torch.exp(0.1 * torch.randn(50, generator=g))
+    assert 1.6 < parting(torch.cat((stands, moves))) < 2.9
+
+
 def test_an_empty_stretch_is_parted_in_its_middle():
     assert parting(torch.tensor([0.5] * 6 + [2.0] * 2)) == pytest.approx(1.0, rel=0.01)
 
