@@ -103,22 +103,24 @@ def parting(u: Tensor) -> float:
         return 0.0
     counts = torch.histc(logs, _BINS, low, high).double().cpu()
     shares, places = counts / counts.sum(), torch.arange(_BINS, dtype=torch.float64)
-    first, sums, squares = ((shares * places**k).cumsum(0) for k in range(3))
-    # neither part is empty: the least value is in the first bin and the largest in the last
-    parts = [(m[:-1], m[-1] - m[:-1]) for m in (first, sums, squares)]
-    p, means = parts[0], [s / n for s, n in zip(parts[1], parts[0], strict=True)]
-    spread = [
-        (q / n - m**2).clamp_min(1 / 12)  # that of one bin
-        for q, n, m in zip(parts[2], p, means, strict=True)
-    ]
-    error = sum(n * (v.log() - 2 * n.log()) for n, v in zip(p, spread, strict=True))
-    error = torch.where(torch.minimum(*p) < _LEAST_PART, math.inf, error)
-    whole = math.log(max(float(squares[-1] - sums[-1] ** 2), 1 / 12))
-    apart = p[0] * p[1] * (means[1] - means[0]) ** 2
-    score = -error if float(error.min()) < whole - _FAR_MORE else apart
+    moments = [(shares * places**k).cumsum(0) for k in range(3)]
+    # neither side is empty: the least value is in the first bin and the largest in the last
+    p, mean, spread = _moments([m[:-1] for m in moments])
+    q, far_mean, far_spread = _moments([m[-1] - m[:-1] for m in moments])
+    error = p * (spread.log() - 2 * p.log()) + q * (far_spread.log() - 2 * q.log())
+    error = torch.where(torch.minimum(p, q) < _LEAST_PART, math.inf, error)
+    alone = float(_moments([m[-1] for m in moments])[2].log())
+    two = float(error.min()) < alone - _FAR_MORE
+    score = -error if two else p * q * (far_mean - mean) ** 2
     # an empty stretch parts the same anywhere: in its middle
     best = float((score >= score.max() - 1e-9 * score.max().abs()).nonzero().double().mean())
     return math.exp(low + (high - low) * (best + 1) / _BINS)
+
+
+def _moments(m: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Share, mean and variance (of one bin at least) from sums of the powers 0 to 2."""
+    mean = m[1] / m[0]
+    return m[0], mean, (m[2] / m[0] - mean**2).clamp_min(1 / 12)
 
 
 def opened(
