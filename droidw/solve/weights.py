@@ -95,13 +95,14 @@ def parting(u: Tensor) -> float:
     Returns:
         A value between the least and the largest; 0 where all are alike.
     """
+    u = u.cpu()  # a GPU waits once
     logs = u[torch.isfinite(u)].clamp_min(_LEAST_PARTED).log()
     if not logs.numel():
         return 0.0
     low, high = (float(end) for end in logs.aminmax())
     if low == high:
         return 0.0
-    counts = torch.histc(logs, _BINS, low, high).double().cpu()
+    counts = torch.histc(logs, _BINS, low, high).double()
     shares, places = counts / counts.sum(), torch.arange(_BINS, dtype=torch.float64)
     moments = [(shares * places**k).cumsum(0) for k in range(3)]
     # neither side is empty: the least value is in the first bin and the largest in the last

@@ -60,8 +60,9 @@ def test_waits_of_the_inner_loop(watch, arguments):
     told = gpu.waits_by_line()
     # What a step must know: which poses move and whether sums are finite; and what came of it.
     assert set(counts["step"]) == {2}, told
-    # One look at the energy, and whether the parameters are finite.
-    assert set(counts["learn"]) == {1}, told
+    # One look at the energy, and whether the parameters are finite; in the last passes of global
+    # adjustment, which presets of published systems do not learn in, also how uncertainty parts.
+    assert set(counts["learn"]) == ({1, 2} if arguments is FLOW else {1}), told
     # Flow is searched on the host, from what geometry predicts: coordinates, which of them are
     # valid, and the gates of uncertainty.
     most = 3 if arguments is FLOW else 0
