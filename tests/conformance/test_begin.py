@@ -1,4 +1,4 @@
-"""What the suite catches of models that begin with what can move (test_builtins.py: a right one)."""
+"""What the suite catches of models that begin with what can move."""
 
 from dataclasses import replace
 
