@@ -66,10 +66,10 @@ class CameraConfig:
     edge: int = opt(0, "pixels cropped off each side after resizing", ge=0)
     refine_focal: bool = opt(True, "look for a better focal length in global adjustment")
     focal_trust: float = opt(
-        10.0,
-        "how hard a known focal length is to move: relative curvature of its prior; one that "
-        "was guessed has a tenth of it",
-        ge=0,
+        10.0, "how hard a focal length is to move: curvature of its prior; a guess: a tenth", ge=0
+    )
+    focal_slack: float = opt(
+        0.01, "a known focal length is kept if what is found differs by less (logarithm)", ge=0
     )
     focal_range: float = opt(0.3, "largest change of the logarithm of the focal length", gt=0, le=1)
 

@@ -101,7 +101,8 @@ def refine_focal(
     Poses and depths are adjusted at every focal length tried, with the measurements that the
     graph holds. The energy counts the prior of `camera.focal_trust` (a tenth of it for a guess),
     and how far lines are from three directions at right angles, where these count: that tells a
-    focal length to some tenths of a per cent.
+    focal length to some tenths of a per cent. Matches have their own bias, so that a calibration
+    which differs from what is found by less than `camera.focal_slack` stays as it is.
 
     Args:
         known: the focal length is a calibration, not a guess.
@@ -137,6 +138,8 @@ def refine_focal(
 
     trust, bound = camera.focal_trust, camera.focal_range
     x, tried = minimise_with_prior(energy, trust if known else _GUESSED * trust, bound)
+    if known and abs(x) < camera.focal_slack:
+        x = 0.0
     place(x)
     optimiser.upright.measure()
     store.write(*states[x])

@@ -70,7 +70,7 @@ PHASES = ", ".join(DroidwConfig().schedule)
         ("camera.long_sid=3",
          "camera.long_sid: there is no such key\n  did you mean 'camera.long_side'?   "
          "keys of camera: calib, focal, fov, long_side, size, edge, refine_focal, "
-         "focal_trust, focal_range"),
+         "focal_trust, focal_slack, focal_range"),
         ("camera.long_side=big",
          "camera.long_side: 'big' is not valid here\n  expected: whole number"),
         ("camera.fov=200", "camera.fov: 200.0 is out of range\n  valid: > 1 and < 179"),
@@ -84,7 +84,7 @@ PHASES = ", ".join(DroidwConfig().schedule)
          "or [] to follow camera.long_side"),
         ("camera=3",
          "camera: 3 is not valid here\n  expected a section with keys: calib, focal, fov, "
-         "long_side, size, edge, refine_focal, focal_trust, focal_range"),
+         "long_side, size, edge, refine_focal, focal_trust, focal_slack, focal_range"),
         ("weighting.gate=step",
          "weighting.gate: 'step' is not valid here\n  expected: one of rational, inverse, none"),
         ("backend.passes=[7, a]",

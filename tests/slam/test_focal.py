@@ -126,6 +126,19 @@ def test_a_right_focal_length_stays(bench):
     assert found.factor == pytest.approx(1.0, abs=0.003)
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_a_calibration_that_is_off_by_less_than_the_search_is_exact_stays(bench, known):
+    for wrong, kept in ((1.006, known), (1.02, False)):
+        optimiser, graph, true = bench(wrong=wrong)
+        camera = CameraConfig(focal_trust=0.0)
+        found = refine_focal(optimiser, graph, PHASE, SOLVER, camera, known)
+        factor = float(optimiser.store.image_intrinsics[0] / true[0]) / wrong
+        assert found.factor == pytest.approx(factor, rel=1e-5)
+        assert (found.factor == 1.0) is kept
+        if not kept:
+            assert found.factor * wrong == pytest.approx(1.0, abs=0.003)
+
+
 def test_a_guess_moves_where_a_calibration_holds(bench):
     factors = []
     for known in (True, False):
