@@ -186,13 +186,17 @@ class FrontendConfig:
 class BackendConfig:
     """Global bundle adjustment after tracking."""
 
-    passes: list[int] = opt([2, 2, 2, 2], "update steps of each global pass")
+    passes: list[int] = opt([2, 2, 2, 2, 2], "update steps of each global pass")
     wide_start: float = opt(
         16.0,
         "how many times wider than `global_solver.cauchy` the kernel of the first of several "
         "passes is: what has broken off is drawn back before its matches are given up",
         ge=1,
     )
+    last_tuning: float = opt(
+        1.0, "`global_solver.cauchy_tuning` after the first pass with it (0: the same)", ge=0
+    )
+    last_slip: float = opt(0.5, "`global_solver.cauchy_slip` of those passes", ge=0)
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)
@@ -200,9 +204,7 @@ class BackendConfig:
     nms_shape: Literal["square", "diamond"] = opt(
         "diamond", "what a chosen edge suppresses; diamond: little near the diagonal"
     )
-    normalize: bool = opt(
-        False, "bring the mean disparity to 1 before each pass, where no depth prior is"
-    )
+    normalize: bool = opt(False, "mean disparity becomes 1 before passes without a depth prior")
     factors_per_keyframe: int = opt(10, "directed edges per keyframe at most", ge=2)
     backwards_below: float = opt(
         0.7,
@@ -212,10 +214,7 @@ class BackendConfig:
         ge=0,
         le=1,
     )
-    splice: bool = opt(
-        True,
-        "of the way that agrees less there and back, take the pieces in which more agrees",
-    )
+    splice: bool = opt(True, "of the way that agrees less, take the pieces in which more agrees")
     restart_below: float = opt(
         0.8,
         "agreement below which pieces that points contradict set out anew even where there is no "

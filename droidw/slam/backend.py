@@ -76,7 +76,7 @@ class Backend:
         wide, anew = self._begins_wide(), False
         for number, updates in enumerate(options.passes):
             solver, prior = self._solver(number, wide), self._prior(number)
-            learns = self.learn and solver is self.config.global_solver
+            learns = self.learn and self._is_narrow(number, wide)
             if learns and not anew:
                 self.optimiser.begin_anew()
                 anew = True
@@ -117,18 +117,27 @@ class Backend:
                 self.agreement = explained_share(store, graph, graph.select(), gates)
         return edges
 
+    def _is_narrow(self, number: int, wide: bool) -> bool:
+        """Whether the kernel of a pass follows the median residual, if `global_solver` says so."""
+        return number > int(wide) or number == len(self.config.backend.passes) - 1
+
     def _solver(self, number: int, wide: bool) -> SolverConfig:
         """The solver of one pass; its kernel narrows from pass to pass.
 
         One that follows the median residual is too narrow to mend what has broken off, as long as
         most of the path is sound. So the last passes alone have it. And they alone let depths go
-        that say little: under a wide kernel wrong matches would carry them off.
+        that say little: under a wide kernel wrong matches would carry them off. Most matches are
+        off by something that they share, and where the path has come to rest by all of them, the
+        half that fits best knows better: the very last passes go by that.
         """
-        solver, last = self.config.global_solver, len(self.config.backend.passes) - 1
+        solver, options = self.config.global_solver, self.config.backend
         if wide and number == 0:
-            return self._wider(self.config.backend.wide_start)
-        if number == int(wide) < last:
+            return self._wider(options.wide_start)
+        if not self._is_narrow(number, wide):
             return replace(solver, cauchy_tuning=0.0, depth_damping=1.0)
+        if options.last_tuning > 0 and number > int(wide) + 1:
+            tuning, slip = options.last_tuning, options.last_slip
+            return replace(solver, cauchy_tuning=tuning, cauchy_slip=slip)
         return solver
 
     def _prior(self, number: int) -> float:

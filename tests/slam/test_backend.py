@@ -57,13 +57,26 @@ def broken(arc, waves, stored):
         seen = ((ii < BROKEN) == (jj < BROKEN))[:, None, None, None]
         return EdgeUpdate(found.target + 0.02 * noise, found.confidence * seen)
 
-    def call(cauchy=0.75, focal=False, joined=True, **backend):
+    def leaning(request):
+        # some noise, and a third of the cells is off alike, by a few times as much
+        ii, jj = torch.tensor(request.ii), torch.tensor(request.jj)
+        target, valid = measured(ii, jj)
+        g = torch.Generator().manual_seed(2)
+        noise = 0.01 * torch.randn(target.shape, generator=g)
+        slipped = torch.rand(H, W, generator=g)[..., None] < 1 / 3
+        alike = slipped * torch.tensor([0.0, -0.06]) * (jj - ii)[:, None, None, None]
+        sure = valid[..., None].float().expand_as(target).contiguous()
+        return EdgeUpdate(target + noise + alike, sure)
+
+    def call(cauchy=0.75, focal=False, joined=True, leans=False, **backend):
         config = DroidwConfig(camera=CameraConfig(refine_focal=focal))
         config.global_solver.cauchy = cauchy
         config.backend = replace(config.backend, **backend)
         store = stored(grid, intrinsics.clone(), start, disps)
         operator = SimpleNamespace(
-            session=lambda purpose: SimpleNamespace(update=answer if joined else blind)
+            session=lambda purpose: SimpleNamespace(
+                update=leaning if leans else answer if joined else blind
+            )
         )
         parts = Parts(None, None, None, TorchBundleAdjuster(), operator)
         optimiser = Optimiser(store, parts, config.weighting, Stopwatch())
@@ -105,6 +118,45 @@ def test_one_pass_and_no_kernel_are_as_they_were(broken, options):
         run(backend)
         poses.append(backend.optimiser.store.T_cw.clone())
     assert torch.equal(*poses)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, [(12, 0, 2), (0.75, 0, 2), (0.75, 5, 2), (0.75, 1, 0.5), (0.75, 1, 0.5)]),
+        ({"last_tuning": 0.0}, [(12, 0, 2), (0.75, 0, 2), *[(0.75, 5, 2)] * 3]),
+        ({"passes": [1, 1, 1]}, [(12, 0, 2), (0.75, 0, 2), (0.75, 5, 2)]),
+        ({"passes": [1, 1, 1], "wide_start": 1.0}, [(0.75, 0, 2), (0.75, 5, 2), (0.75, 1, 0.5)]),
+        ({"passes": [1, 1]}, [(12, 0, 2), (0.75, 5, 2)]),
+        ({"passes": [1]}, [(0.75, 5, 2)]),
+    ],
+)
+def test_the_kernel_narrows_from_pass_to_pass(broken, monkeypatch, options, expected):
+    """Width, times the median residual, and what of a slip counts."""
+    backend, _ = broken(**{"passes": [1] * 5, **options})
+    heard = []
+    monkeypatch.setattr(
+        backend.optimiser,
+        "update",
+        lambda graph, session, phase, s, **more: heard.append(
+            (s.cauchy, s.cauchy_tuning, s.cauchy_slip)
+        ),
+    )
+    run(backend)
+    assert heard == expected
+
+
+def test_the_last_passes_go_by_the_matches_that_fit_best(broken, arc):
+    def turned_off(T_cw, right):
+        found, true = (mul(T[1:], inv(T[:-1])) for T in (T_cw, right))
+        return float(log(mul(found, inv(true)))[:, 3:].norm(dim=-1).mean())
+
+    off = []
+    for tuning in (0.0, 1.0):
+        backend, _ = broken(leans=True, last_tuning=tuning)
+        run(backend)
+        off.append(turned_off(backend.optimiser.store.T_cw, arc(COUNT)))
+    assert off[1] < 0.6 * off[0]
 
 
 @pytest.mark.parametrize(
