@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,6 +17,8 @@ from droidw.geometry.camera import Camera
 from droidw.io.files import read_text
 
 __all__ = ["read_calibration"]
+
+_log = logging.getLogger(__name__)
 
 _VALID = """valid are
 `key value` lines: width height fx fy cx cy, and dist k1 k2 p1 p2 [k3 ...] if there is any;
@@ -45,7 +48,8 @@ def read_calibration(path: Path | str, width: int, height: int) -> tuple[Camera,
     """Read a calibration for pictures of `width` x `height` pixels.
 
     One for another size with the same aspect (to half a percent) is scaled. COLMAP counts the
-    centre of the first pixel as (0.5, 0.5), so half a pixel is taken off its principal point.
+    centre of the first pixel as (0.5, 0.5), so half a pixel is taken off its principal point; and
+    off one at exactly half of width and height, which is the middle of a picture counted so.
     A file without a size is taken to be for these pictures.
 
     Returns:
@@ -71,7 +75,23 @@ def read_calibration(path: Path | str, width: int, height: int) -> tuple[Camera,
         camera, where = _from_droid(path, lines, width, height)
     else:
         camera, where = _from_keys(path, lines, width, height)
-    return _fit(camera.validated(where), width, height, where)
+    return _fit(_centred(camera.validated(where), where), width, height, where)
+
+
+def _centred(camera: Camera, where: str) -> Camera:
+    """The camera with its axis in the middle, where it is said to be at half of the size.
+
+    No measurement ends at exactly (320, 240) of 640x480: that is what renderers and data sheets
+    call the middle, which is (319.5, 239.5) where pixel centres are at integers.
+    """
+    if (camera.cx, camera.cy) != (camera.width / 2, camera.height / 2):
+        return camera
+    middle = replace(camera, cx=(camera.width - 1) / 2, cy=(camera.height - 1) / 2)
+    _log.info(
+        "%s: a principal point at half of the size is the middle of the picture, here (%g, %g)",
+        where, middle.cx, middle.cy,
+    )  # fmt: skip
+    return middle
 
 
 def _fit(camera: Camera, width: int, height: int, where: str) -> tuple[Camera, str]:

@@ -50,8 +50,8 @@ _STARTS, _FITTED = 14, 3
 _ALIKE = 0.05
 # Lines that tell how a camera is turned, at least.
 _LEAST = 6
-# Angle at which a line agrees with a direction: one in twenty does by chance.
-_AGREES = np.radians(1.5)
+# Angle at which a line agrees with a direction: one in twenty-five does by chance.
+_AGREES = np.radians(1.2)
 # Radians from one picture to the next by which directions are still followed.
 _FOLLOWED = np.radians(20.0)
 # Radians from what lines say at which a pose is hardly held to it any more.

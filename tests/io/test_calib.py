@@ -31,24 +31,24 @@ FIVE = (0.1, -0.2, 0.001, 0.002, 0.3)
     ("name", "text", "numbers", "distortion", "model"),
     [
         ("c.txt", KEYS, (535.4, 539.2, 320.1, 247.6), FIVE, "opencv"),
-        ("c.txt", "fx: 500\nfy = 501\ncx 320\ncy 240\n", (500, 501, 320, 240), (), "pinhole"),
+        ("c.txt", "fx: 500\nfy = 501\ncx 318\ncy 242\n", (500, 501, 318, 242), (), "pinhole"),
         (
-            "c.txt", "model fisheye\nfx 300\nfy 300\ncx 320\ncy 240\ndist 0.1 0.2 0.3 0.4\n",
-            (300, 300, 320, 240), (0.1, 0.2, 0.3, 0.4), "fisheye",
+            "c.txt", "model fisheye\nfx 300\nfy 300\ncx 318\ncy 242\ndist 0.1 0.2 0.3 0.4\n",
+            (300, 300, 318, 242), (0.1, 0.2, 0.3, 0.4), "fisheye",
         ),
-        ("c.txt", "500 501 320 240\n", (500, 501, 320, 240), (), "pinhole"),
-        ("c.txt", "500,501, 320,240\n", (500, 501, 320, 240), (), "pinhole"),
+        ("c.txt", "500 501 318 242\n", (500, 501, 318, 242), (), "pinhole"),
+        ("c.txt", "500,501, 318,242\n", (500, 501, 318, 242), (), "pinhole"),
         (
-            "c.txt", "500 501 320 240 0.1 -0.2 0.001 0.002 0.3", (500, 501, 320, 240), FIVE,
+            "c.txt", "500 501 318 242 0.1 -0.2 0.001 0.002 0.3", (500, 501, 318, 242), FIVE,
             "opencv",
         ),
         (
-            "c.txt", "500 501 320 240 .1 .2 .3 .4 .5 .6 .7 .8", (500, 501, 320, 240),
+            "c.txt", "500 501 318 242 .1 .2 .3 .4 .5 .6 .7 .8", (500, 501, 318, 242),
             (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8), "opencv",
         ),
         (
-            "c.yaml", "width: 640\nheight: 480\ncalibration: [500, 501, 320, 240, 0.1, 0, 0, 0]\n",
-            (500, 501, 320, 240), (0.1, 0, 0, 0), "opencv",
+            "c.yaml", "width: 640\nheight: 480\ncalibration: [500, 501, 318, 242, 0.1, 0, 0, 0]\n",
+            (500, 501, 318, 242), (0.1, 0, 0, 0), "opencv",
         ),
         (
             "cameras.txt", "# Camera list\n1 SIMPLE_PINHOLE 640 480 500 320 240\n",
@@ -81,6 +81,25 @@ def test_every_format(tmp_path, name, text, numbers, distortion, model):
     assert camera.distortion == pytest.approx(distortion)
     assert camera.model == model
     assert note == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("c.txt", "500 501 320 240\n"),
+        ("c.txt", "width 640\nheight 480\nfx 500\nfy 501\ncx 320\ncy 240\n"),
+        ("c.yaml", "width: 640\nheight: 480\ncalibration: [500, 501, 320, 240]\n"),
+        ("cameras.txt", "1 PINHOLE 640 480 500 501 320 240"),
+    ],
+)
+def test_half_of_the_size_is_the_middle_of_the_picture(tmp_path, name, text):
+    camera, _ = read(tmp_path, text, name)
+    assert (camera.cx, camera.cy) == (319.5, 239.5)
+
+
+def test_half_of_one_side_alone_is_a_measurement(tmp_path):
+    camera, _ = read(tmp_path, "500 501 320 240.3\n")
+    assert (camera.cx, camera.cy) == (320, 240.3)
 
 
 def test_a_calibration_for_another_size_is_scaled_with_its_half_pixel_and_said_so(tmp_path):
