@@ -319,7 +319,7 @@ class LinesConfig:
         ge=0,
     )
     least_share: float = opt(
-        0.75,
+        0.8,
         "share of the length of all lines that must be along such directions, in half of the first "
         "keyframes and later of all, for them to count",
         ge=0,
