@@ -77,8 +77,8 @@ class Backend:
         for number, updates in enumerate(options.passes):
             solver, prior = self._solver(number, wide), self._prior(number)
             learns = self.learn and self._is_narrow(number, wide)
-            if learns:
-                self._learn_anew(first=not anew)
+            if learns and not anew:
+                self.optimiser.begin_anew()
                 anew = True
             phase = replace(row, learn=row.learn or learns)
             if options.normalize and not bool(store["prior"].any()):
@@ -116,17 +116,6 @@ class Backend:
                 gates = self.optimiser.gates()
                 self.agreement = explained_share(store, graph, graph.select(), gates)
         return edges
-
-    def _learn_anew(self, first: bool) -> None:
-        """Before a pass in which uncertainty learns: from the beginning, or by what it has learned.
-
-        Lines were told apart from what may move by the gates of tracking. What these closed for
-        nothing, as the room behind a door, lacks its lines until they are looked at again.
-        """
-        if first:
-            self.optimiser.begin_anew()
-        else:
-            self.optimiser.upright.measure()
 
     def _is_narrow(self, number: int, wide: bool) -> bool:
         """Whether the kernel of a pass follows the median residual, if `global_solver` says so."""

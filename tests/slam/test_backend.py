@@ -257,17 +257,16 @@ def test_the_focal_length_is_looked_for_after_the_first_pass_that_is_not_wide(
     ("learn", "in_all", "options", "expected"),
     [
         # neither in the wide pass nor in that before the focal length
-        (True, False, {}, [False, False, "anew", True, "lines", True]),
-        (True, False, {"wide_start": 1.0}, [False, "anew", True, "lines", True, "lines", True]),
+        (True, False, {}, [False, False, "anew", True, True]),
+        (True, False, {"wide_start": 1.0}, [False, "anew", True, True, True]),
         (True, False, {"passes": [1]}, ["anew", True]),
-        (True, True, {}, [True, True, "anew", True, "lines", True]),
+        (True, True, {}, [True, True, "anew", True, True]),
         (False, False, {}, [False] * 4),
     ],
 )
 def test_uncertainty_learns_anew_when_the_path_is_mended(
     broken, monkeypatch, learn, in_all, options, expected
 ):
-    """And lines are told apart from what may move by what it has learned since."""
     backend, _ = broken(**{"passes": [1, 1, 1, 1], **options})
     backend.config.schedule["global"].learn = in_all
     backend.learn = learn
@@ -278,7 +277,6 @@ def test_uncertainty_learns_anew_when_the_path_is_mended(
         lambda graph, session, phase, solver, **more: heard.append(phase.learn),
     )
     monkeypatch.setattr(backend.optimiser, "begin_anew", lambda: heard.append("anew"))
-    monkeypatch.setattr(backend.optimiser.upright, "measure", lambda: heard.append("lines"))
     run(backend)
     assert heard == expected
 
