@@ -137,7 +137,7 @@ def test_lines_hold_a_rendered_room(system, rendered):
         outcome = slam.finish(lambda frames=frames: iter(frames))
         known = slam.store["axes_information"].flatten(1).any(dim=1)
         assert slam.optimiser.upright.holds is (weight > 0)
-        assert int(known.sum()) >= 4 * (weight > 0)
+        assert (int(known.sum()) > len(known) / 2) is (weight > 0)
         assert all((info.lines is None) is (weight == 0) for info in slam.store.infos)
         paths[weight, threaded] = outcome.trajectory.T_wc
         true = [rendered("handheld")[1].T_wc(k.index) for k in outcome.keyframes]
