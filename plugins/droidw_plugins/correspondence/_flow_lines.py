@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from droidw_plugins.correspondence._flow_information import slopes
+from droidw_plugins.correspondence._flow_information import sample, slopes
 from droidw_plugins.correspondence._flow_types import Array
 
 __all__ = ["line_segments"]
@@ -87,11 +87,8 @@ def _steepest(
     across = np.arange(-_REACH, _REACH + _APART / 2, _APART, dtype=np.float32)
     places = middles[:, None] + part[None, :, None] * way[:, None]
     points = places[:, :, None] + across[None, None, :, None] * normal[:, None, None]
-    flat = points.reshape(len(middles), -1, 2).astype(np.float32)
-    seen = [
-        cv2.remap(d, flat[..., 0], flat[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-        for d in (dx, dy)
-    ]
+    flat = points.reshape(len(middles), -1, 2)
+    seen = [sample(d, flat, outside=0.0) for d in (dx, dy)]
     slope = (seen[0] * normal[:, :1] + seen[1] * normal[:, 1:]).reshape(points.shape[:3])
     near = len(across) // 2
     sign = np.sign(slope[:, :, near - 1 : near + 2].sum(axis=(1, 2)))
