@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from droidw.config.fields import opt
+
 __all__ = [
     "BackendConfig",
     "CameraConfig",
@@ -24,15 +26,6 @@ __all__ = [
     "WeightingConfig",
     "opt",
 ]
-
-
-def opt(default: Any, help: str, **limits: Any) -> Any:
-    """A dataclass field with help text and limits (`ge`, `gt`, `le`, `lt`)."""
-    metadata = {"help": help, **limits}
-    if isinstance(default, (list, dict)):
-        value = default
-        return field(default_factory=lambda: type(value)(value), metadata=metadata)
-    return field(default=default, metadata=metadata)
 
 
 @dataclass
@@ -123,6 +116,13 @@ class SolverConfig:
         "directions in which the match is known: gives up what has slipped along a line",
         ge=0,
     )
+    planes: float = opt(
+        0.0,
+        "how much it counts in steps of all keyframes that walls and floors are flat, where lines "
+        "do: a cell that is off by a hundredth of its depth as much as so many matches with a "
+        "usual residual (0: not at all)",
+        ge=0,
+    )
     guard: bool = opt(False, "shorten or reject a step that raises the energy")
 
 
@@ -197,6 +197,7 @@ class BackendConfig:
         1.0, "`global_solver.cauchy_tuning` after the first pass with it (0: the same)", ge=0
     )
     last_slip: float = opt(0.5, "`global_solver.cauchy_slip` of those passes", ge=0)
+    last_planes: float = opt(0.3, "`global_solver.planes` of those passes", ge=0)
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)

@@ -136,8 +136,8 @@ class Backend:
         if not self._is_narrow(number, wide):
             return replace(solver, cauchy_tuning=0.0, depth_damping=1.0)
         if options.last_tuning > 0 and number > int(wide) + 1:
-            tuning, slip = options.last_tuning, options.last_slip
-            return replace(solver, cauchy_tuning=tuning, cauchy_slip=slip)
+            solver = replace(solver, planes=options.last_planes)
+            return replace(solver, cauchy_tuning=options.last_tuning, cauchy_slip=options.last_slip)
         return solver
 
     def _prior(self, number: int) -> float:

@@ -294,11 +294,14 @@ class Optimiser:
             pairs=edges.pairs,
         )
         problem = replace(problem, pose_term=self._known(problem, low, motion_prior))
-        step = self.parts.ba.step(redescended(problem, solver))
+        problem = redescended(problem, solver)
+        if low == 0 and solver.planes > 0:
+            problem = self.upright.flat(problem, gates, solver.planes * self.usual)
+        step = self.parts.ba.step(problem)
         self._note(step.report)
         self.cost = step.report.cost_before
-        store.T_cw[low:] = step.T_cw
-        store.disps[low:] = step.disps
+        store.T_cw[low:] = step.T_cw[:count]
+        store.disps[low:] = step.disps[:count]
 
     def _known(self, problem: BAProblem, low: int, motion_prior: float) -> PoseTerm | None:
         """What is known of the poses from `low` on besides matches."""

@@ -20,6 +20,7 @@ from droidw.solve.manhattan import (
     next_axes,
     rotation_term,
 )
+from droidw.solve.planes import held_to_planes
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from droidw.graph.store import KeyframeStore
     from droidw.interfaces.correspondence import Correspondence
     from droidw.slam.timing import Stopwatch
-    from droidw.solve.problem import PoseTerm
+    from droidw.solve.problem import BAProblem, PoseTerm
 
 __all__ = ["Upright"]
 
@@ -198,6 +199,18 @@ class Upright:
         information = store["axes_information"][first:]
         weight = self._weight * usual
         return rotation_term(T_cw, store["axes"][first:], information, self._world(known), weight)
+
+    def flat(self, problem: BAProblem, gates: Tensor, weight: float) -> BAProblem:
+        """The problem of all keyframes with walls and floors held to be flat, where lines count.
+
+        Args:
+            gates: [N,h,w]. weight: in the units of the energy of `BAProblem`.
+        Returns:
+            It may have keyframes behind the others, as of `held_to_planes`.
+        """
+        if not self.holds or weight <= 0:
+            return problem
+        return held_to_planes(problem, self._world(self._known()), gates, weight)
 
     def _known(self) -> list[int]:
         """Keyframes whose axes count."""
