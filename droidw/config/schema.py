@@ -197,7 +197,7 @@ class BackendConfig:
         1.0, "`global_solver.cauchy_tuning` after the first pass with it (0: the same)", ge=0
     )
     last_slip: float = opt(0.5, "`global_solver.cauchy_slip` of those passes", ge=0)
-    last_planes: float = opt(0.3, "`global_solver.planes` of those passes", ge=0)
+    last_planes: float = opt(0.01, "`global_solver.planes` of those passes", ge=0)
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)

@@ -135,9 +135,11 @@ class Backend:
             return self._wider(options.wide_start)
         if not self._is_narrow(number, wide):
             return replace(solver, cauchy_tuning=0.0, depth_damping=1.0)
-        if options.last_tuning > 0 and number > int(wide) + 1:
+        if number > int(wide) + 1:
             solver = replace(solver, planes=options.last_planes)
-            return replace(solver, cauchy_tuning=options.last_tuning, cauchy_slip=options.last_slip)
+            if options.last_tuning > 0:
+                tuning, slip = options.last_tuning, options.last_slip
+                solver = replace(solver, cauchy_tuning=tuning, cauchy_slip=slip)
         return solver
 
     def _prior(self, number: int) -> float:

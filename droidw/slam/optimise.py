@@ -295,8 +295,7 @@ class Optimiser:
         )
         problem = replace(problem, pose_term=self._known(problem, low, motion_prior))
         problem = redescended(problem, solver)
-        if low == 0 and solver.planes > 0:
-            problem = self.upright.flat(problem, gates, solver.planes * self.usual)
+        problem = self.upright.flat(problem, gates, solver.planes * self.usual)
         step = self.parts.ba.step(problem)
         self._note(step.report)
         self.cost = step.report.cost_before

@@ -201,14 +201,15 @@ class Upright:
         return rotation_term(T_cw, store["axes"][first:], information, self._world(known), weight)
 
     def flat(self, problem: BAProblem, gates: Tensor, weight: float) -> BAProblem:
-        """The problem of all keyframes with walls and floors held to be flat, where lines count.
+        """A problem of all keyframes with walls and floors held to be flat, where lines count.
 
         Args:
             gates: [N,h,w]. weight: in the units of the energy of `BAProblem`.
         Returns:
-            It may have keyframes behind the others, as of `held_to_planes`.
+            It may have keyframes behind the others, as of `held_to_planes`. A problem of some
+            keyframes is returned as it is.
         """
-        if not self.holds or weight <= 0:
+        if not self.holds or weight <= 0 or len(problem.T_cw) < len(self._store):
             return problem
         return held_to_planes(problem, self._world(self._known()), gates, weight)
 

@@ -37,7 +37,7 @@ _BINS, _SPREAD = 2.0, (0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25)
 _ROUNDS = 5
 # Cells of a keyframe on one plane below which they are left alone.
 _LEAST_CELLS = 10
-# Where the camera of a plane is, in median depths.
+# How far behind all cells the camera of a plane is, in median depths.
 _AWAY = 20.0
 
 
@@ -115,7 +115,8 @@ def held_to_planes(problem: BAProblem, upright: Tensor, open_: Tensor, weight: f
     planes = [] if cells is None else _planes(cells)
     if cells is None or not planes:
         return problem
-    centre = (inv(problem.T_cw.double())[:, :3] @ upright).mean(0)
+    used = cells.points[cells.weight > 0]
+    behind = used.amin(0) - _AWAY * cells.median
     off = torch.stack([cells.points[..., plane.axis] - plane.offset for plane in planes])
     nearest, width = off.abs().argmin(0), cells.width()
     cameras, ii, jj, held = [], [], [], []
@@ -123,9 +124,8 @@ def held_to_planes(problem: BAProblem, upright: Tensor, open_: Tensor, weight: f
         information = _kernel(off[k], width) * cells.weight / width.square()
         information = torch.where(nearest == k, information, 0.0)
         at = ((information > 0).sum(1) >= _LEAST_CELLS).nonzero().flatten()
-        place = centre.clone()
+        place = behind.clone()
         place[plane.axis] = plane.offset
-        place[plane.along] -= _AWAY * cells.median
         depth = cells.points[at][..., plane.along] - place[plane.along]
         # what is e off the plane is seen focal * e / depth off the row
         held.append(weight * information[at] * (depth / problem.intrinsics[1]).square())

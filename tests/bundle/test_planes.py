@@ -146,6 +146,19 @@ def test_a_cell_costs_what_it_is_off():
     torch.testing.assert_close(total, expected, rtol=1e-6, atol=1e-9)
 
 
+def test_a_plane_reaches_as_far_as_the_path():
+    T_cw, disps = room()
+    centres = se3.inv(T_cw)
+    centres[HALF:, :3] += 500.0 * UPRIGHT[:, 2]
+    problem = matches(se3.inv(centres), disps, neighbours(0, COUNT))
+    held = held_to_planes(problem, UPRIGHT, torch.ones_like(disps), 1.0)
+    _, valid = reproject(held.T_cw, held.disps, INTRINSICS, held.ii, held.jj)
+    added = slice(len(problem.ii), None)
+    weighs = held.weight[added, ..., 1] > 0
+    assert bool(valid[added][weighs].all())
+    assert set(held.ii[added].tolist()) == set(range(COUNT))
+
+
 def test_what_else_is_known_of_poses_stays():
     T_cw, disps = room()
     g = torch.Generator().manual_seed(0)

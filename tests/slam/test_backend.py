@@ -146,6 +146,27 @@ def test_the_kernel_narrows_from_pass_to_pass(broken, monkeypatch, options, expe
     assert heard == expected
 
 
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, [0, 0, 0, 0.1, 0.1]),
+        ({"last_planes": 0.0}, [0] * 5),
+        ({"last_tuning": 0.0}, [0, 0, 0, 0.1, 0.1]),
+    ],
+)
+def test_walls_are_held_to_be_flat_in_the_last_passes(broken, monkeypatch, options, expected):
+    """Before these, the path may be off by more than a plane is wide."""
+    backend, _ = broken(**{"passes": [1] * 5, "last_planes": 0.1, **options})
+    heard = []
+    monkeypatch.setattr(
+        backend.optimiser,
+        "update",
+        lambda graph, session, phase, s, **more: heard.append(s.planes),
+    )
+    run(backend)
+    assert heard == expected
+
+
 def test_the_last_passes_go_by_the_matches_that_fit_best(broken, arc):
     def turned_off(T_cw, right):
         found, true = (mul(T[1:], inv(T[:-1])) for T in (T_cw, right))

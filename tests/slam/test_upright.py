@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +13,11 @@ import torch
 from droidw.config.schema import LinesConfig
 from droidw.geometry import se3
 from droidw.geometry.camera import Grid
+from droidw.geometry.projective import reproject, viewing_rays
 from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.slam.timing import Stopwatch
 from droidw.slam.upright import Upright
+from droidw.solve.problem import BAProblem
 
 GRID, INTRINSICS = Grid(15, 20, 16, 7.5), torch.tensor([200.0, 200.0, 160.0, 120.0])
 COUNT = 8
@@ -117,6 +120,34 @@ def test_what_lines_say_leads_back(build):
     assert float(apart(back, true[3])) < 0.1
     other = upright.term(store.T_cw[2:], 2, usual=0.02)
     assert torch.allclose(other.rhs, 2 * term.rhs)
+
+
+def test_walls_are_flat_in_a_problem_of_all_keyframes_where_lines_count(build):
+    upright, store, append, _ = build()
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    # a wall 2 in front of the first camera, square to the axes
+    rays = viewing_rays(GRID.height, GRID.width, store.intrinsics)
+    R, centres = se3.rotation(store.T_cw), se3.inv(store.T_cw)[:, :3]
+    ahead = torch.einsum("nj,hwj->nhw", R[:, :, 2], rays)
+    store.disps[:] = (ahead / (2.0 - centres[:, 2, None, None])).clamp_min(1e-3)
+    count = torch.arange(COUNT)
+    ii, jj = count[:-1], count[1:]
+    target, _ = reproject(store.T_cw, store.disps, store.intrinsics, ii, jj)
+    problem = BAProblem(
+        store.T_cw, store.disps, store.intrinsics, ii, jj, target,
+        torch.ones_like(target), count == 0, torch.ones_like(store.disps),
+    )  # fmt: skip
+    gates = torch.ones_like(store.disps)
+    held = upright.flat(problem, gates, 0.1)
+    assert len(held.T_cw) == COUNT + 1
+    assert len(held.ii) == len(ii) + COUNT
+    assert upright.flat(problem, gates, 0.0) is problem
+    part = replace(problem, T_cw=problem.T_cw[1:])
+    assert upright.flat(part, gates[1:], 0.1) is part
+    upright.holds = False
+    assert upright.flat(problem, gates, 0.1) is problem
 
 
 def askew(count=COUNT, seed=1):
