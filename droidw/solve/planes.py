@@ -35,6 +35,8 @@ _LEAST_SHARE, _MOST, _APART = 0.05, 6, 8.0
 _BINS, _SPREAD = 2.0, (0.25, 0.5, 0.75, 1.0, 0.75, 0.5, 0.25)
 # Rounds of a fit.
 _ROUNDS = 5
+# A cell without any disparity is far away, and not nowhere.
+_LEAST_DISP = 1e-9
 # Cells of a keyframe on one plane below which they are left alone.
 _LEAST_CELLS = 10
 # How far behind all cells the camera of a plane is, in median depths.
@@ -197,7 +199,7 @@ def _cells(
     """None where nothing is open."""
     h, w = disps.shape[-2:]
     rays = viewing_rays(h, w, intrinsics.double()).view(-1, 3)
-    depth = disps.double().flatten(1).reciprocal()
+    depth = disps.double().flatten(1).clamp_min(_LEAST_DISP).reciprocal()
     weight = open_.double().flatten(1)
     T = T_cw.double()
     points = (rays @ (rotation(T) @ upright)) * depth[..., None]

@@ -106,6 +106,10 @@ def test_what_is_closed_or_far_is_no_plane():
     far = torch.where(torch.arange(H)[:, None] < H // 2, disps / 600, disps)
     found = find_planes(T_cw, far, INTRINSICS, UPRIGHT, torch.ones_like(disps))
     assert all(abs(p.offset) < 10 for p in found)
+    nowhere = torch.where(torch.arange(H)[:, None] < H // 2, torch.zeros_like(disps), disps)
+    held = held_to_planes(replace(problem, disps=nowhere), UPRIGHT, torch.ones_like(disps), 1.0)
+    assert len(held.T_cw) > COUNT
+    assert bool(torch.isfinite(held.weight).all())
 
 
 def test_a_cell_costs_what_it_is_off():

@@ -36,15 +36,15 @@ PAPER = {
     },
     "solver": {
         "lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0,
-        "cauchy_slip": 0.0, "guard": False, "depth_damping": 1.0,
+        "cauchy_slip": 0.0, "guard": False, "depth_damping": 1.0, "planes": 0.0,
     },
     "global_solver": {
         "lm": 1e-5, "ep": 1e-2, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0,
-        "cauchy_slip": 0.0, "guard": False, "depth_damping": 1.0,
+        "cauchy_slip": 0.0, "guard": False, "depth_damping": 1.0, "planes": 0.0,
     },
     "filler_solver": {
         "lm": 1e-4, "ep": 0.1, "huber": 0.0, "cauchy": 0.0, "cauchy_tuning": 0.0,
-        "cauchy_slip": 0.0, "guard": False, "depth_damping": 1.0,
+        "cauchy_slip": 0.0, "guard": False, "depth_damping": 1.0, "planes": 0.0,
     },
     "seed": 43, "compat": [], "camera.refine_focal": False,
 }  # fmt: skip

@@ -114,7 +114,11 @@ def test_what_lines_are_off_counts_in_the_search(bench, count, leads_to):
         return count * math.log(float(intrinsics[0] / true[0]) / 1.03) ** 2
 
     optimiser.upright = SimpleNamespace(
-        holds=True, term=lambda *_: None, refit=refit, measure=lambda: None
+        holds=True,
+        term=lambda *_: None,
+        flat=lambda problem, *_: problem,
+        refit=refit,
+        measure=lambda: None,
     )
     found = refine_focal(optimiser, graph, PHASE, SOLVER, CameraConfig(focal_trust=0.0), known=True)
     assert 1.08 * found.factor == pytest.approx(leads_to, abs=0.012)
