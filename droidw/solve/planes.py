@@ -212,14 +212,14 @@ def _cells(
 
 
 def _planes(cells: _Cells) -> list[Plane]:
-    total = float(cells.weight.sum())
+    total, width = float(cells.weight.sum()), cells.width()
     found = []
     for axis in range(3):
         at = cells.points[..., axis]
         for start, share in _peaks(at, cells, total):
             offset = start
             for _ in range(_ROUNDS):
-                kept = _kernel(at - offset, cells.width()) * cells.weight
+                kept = _kernel(at - offset, width) * cells.weight
                 offset = float((kept * at).sum() / kept.sum().clamp_min(1e-12))
             found.append(Plane(axis, offset, share))
     return found
