@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from droidw.config.fields import opt
+from droidw.config.solving import LinesConfig, PhaseConfig, SolverConfig, WeightingConfig
 
 __all__ = [
     "BackendConfig",
@@ -19,6 +20,7 @@ __all__ = [
     "FillerConfig",
     "FrontendConfig",
     "InputConfig",
+    "LinesConfig",
     "MotionFilterConfig",
     "PhaseConfig",
     "SlotConfig",
@@ -94,50 +96,6 @@ class MotionFilterConfig:
 
 
 @dataclass
-class SolverConfig:
-    """Damping and robustness of bundle adjustment in one phase."""
-
-    lm: float = opt(1e-4, "relative damping of the reduced system", ge=0)
-    ep: float = opt(0.1, "absolute damping of the reduced system", ge=0)
-    depth_damping: float = opt(1.0, "factor on the damping of depths (`weighting`)", ge=0)
-    huber: float = opt(0.2, "Huber threshold in grid cells (0: quadratic)", ge=0)
-    cauchy: float = opt(
-        0.0, "residual in grid cells at which a Cauchy kernel halves a weight (0: none)", ge=0
-    )
-    cauchy_tuning: float = opt(
-        0.0,
-        "makes that kernel follow what was measured: this many times the median residual wide, "
-        "`cauchy` at most (0: always `cauchy`)",
-        ge=0,
-    )
-    cauchy_slip: float = opt(
-        0.0,
-        "share of a residual's whole length that this kernel counts besides its length in the "
-        "directions in which the match is known: gives up what has slipped along a line",
-        ge=0,
-    )
-    planes: float = opt(
-        0.0,
-        "how much it counts in steps of all keyframes that walls and floors are flat, where lines "
-        "do: a cell that is off by a hundredth of its depth as much as so many matches with a "
-        "usual residual (0: not at all)",
-        ge=0,
-    )
-    guard: bool = opt(False, "shorten or reject a step that raises the energy")
-
-
-@dataclass
-class PhaseConfig:
-    """One row of the schedule (REFERENCE 4.4): how one phase alternates its parts."""
-
-    updates: int = opt(4, "update steps (correspondence, then bundle adjustment)", ge=0)
-    iterations: int = opt(2, "Gauss-Newton iterations per update step", ge=1)
-    learn: bool = opt(True, "uncertainty is updated after each Gauss-Newton iteration")
-    weigh: bool = opt(True, "uncertainty weighs the residuals")
-    depth_prior: bool = opt(True, "the depth prior takes part")
-
-
-@dataclass
 class FrontendConfig:
     """Initialisation and the sliding window."""
 
@@ -197,7 +155,16 @@ class BackendConfig:
         1.0, "`global_solver.cauchy_tuning` after the first pass with it (0: the same)", ge=0
     )
     last_slip: float = opt(0.5, "`global_solver.cauchy_slip` of those passes", ge=0)
-    last_planes: float = opt(0.01, "`global_solver.planes` of those passes", ge=0)
+    last_planes: float = opt(
+        0.01, "`global_solver.planes` of those passes, where `planes_hidden` is", ge=0
+    )
+    planes_hidden: float = opt(
+        0.05,
+        "share of all cells that uncertainty and masks close, from which `last_planes` counts: "
+        "what is in sight is better known by its matches",
+        ge=0,
+        le=1,
+    )
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)
@@ -271,63 +238,6 @@ class FillerConfig:
     batch: int = opt(16, "frames per batch", ge=1)
     cache_mb: int = opt(
         512, "memory for what correspondence keeps of frames; beyond it they are read again", ge=0
-    )
-
-
-@dataclass
-class WeightingConfig:
-    """How similarity becomes uncertainty u, and u a weight in [0,1] (REFERENCE 3.1)."""
-
-    similarity: Literal["matched", "raw"] = opt(
-        "matched",
-        "how alike features are: matched: on one scale for all extractors, by measured matches; "
-        "raw: their cosine, as published",
-    )
-    gate: Literal["rational", "inverse", "none"] = opt(
-        "rational", "rational: 1/max(slope*u - shift, floor); inverse: 1/u; both clamped to [0,1]"
-    )
-    slope: float = opt(45.0, "slope of the rational gate", gt=0)
-    shift: float = opt(35.0, "shift of the rational gate", ge=0)
-    parted: bool = opt(
-        True, "after `backend.learn` half closed where values part best in two, if later"
-    )
-    floor: float = opt(0.1, "smallest denominator of the rational gate", gt=0)
-    open_share: float = opt(
-        0.5,
-        "share of each picture, of what is least uncertain, that keeps its whole weight: most of "
-        "what is seen stands still (0: no such share)",
-        ge=0,
-        le=1,
-    )
-    bidirectional: bool = opt(False, "also weigh by the gate sampled in the target frame")
-    confidence_scale: float = opt(1.0, "factor on the confidence of correspondence", gt=0)
-    damping_scale: float = opt(0.2, "factor on the learned depth damping", ge=0)
-    damping_floor: float = opt(0.1, "added to the depth damping", ge=0)
-    prior_weight: float = opt(0.001, "gamma_d, weight of the depth prior", ge=0)
-    min_disp: float = opt(1e-3, "smallest disparity", gt=0)
-    max_disp: float = opt(0.0, "largest disparity (0: unbounded)", ge=0)
-
-
-@dataclass
-class LinesConfig:
-    """Lines along three directions at right angles, which tell how the camera is turned."""
-
-    weight: float = opt(
-        30.0,
-        "how much they count: a line whose end is a fifth of a pixel off the direction that its "
-        "keyframe's pose gives it as much as so many matches with a usual residual, of a "
-        "correspondence that finds lines (0: not at all)",
-        ge=0,
-    )
-    least_share: float = opt(
-        0.8,
-        "share of the length of all lines that must be along such directions, in half of the first "
-        "keyframes and later of all, for them to count",
-        ge=0,
-        le=1,
-    )
-    doubt: float = opt(
-        0.75, "factor on `backwards_below`, `restart_below`, `again_below` where lines count", ge=0
     )
 
 

@@ -128,7 +128,8 @@ class Backend:
         most of the path is sound. So the last passes alone have it. And they alone let depths go
         that say little: under a wide kernel wrong matches would carry them off. Most matches are
         off by something that they share, and where the path has come to rest by all of them, the
-        half that fits best knows better: the very last passes go by that.
+        half that fits best knows better: the very last passes go by that. Walls and floors make up
+        there for what is hidden; where little is, they know less than matches do.
         """
         solver, options = self.config.global_solver, self.config.backend
         if wide and number == 0:
@@ -136,11 +137,16 @@ class Backend:
         if not self._is_narrow(number, wide):
             return replace(solver, cauchy_tuning=0.0, depth_damping=1.0)
         if number > int(wide) + 1:
-            solver = replace(solver, planes=options.last_planes)
+            if options.last_planes > 0 and self._hidden() >= options.planes_hidden:
+                solver = replace(solver, planes=options.last_planes)
             if options.last_tuning > 0:
                 tuning, slip = options.last_tuning, options.last_slip
                 solver = replace(solver, cauchy_tuning=tuning, cauchy_slip=slip)
         return solver
+
+    def _hidden(self) -> float:
+        """Share of all cells that are closed, by uncertainty or a mask."""
+        return float((self.optimiser.gates() < 0.5).float().mean())
 
     def _prior(self, number: int) -> float:
         """How much steady motion counts in one pass; measurements have the last word."""

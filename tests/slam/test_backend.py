@@ -147,16 +147,25 @@ def test_the_kernel_narrows_from_pass_to_pass(broken, monkeypatch, options, expe
 
 
 @pytest.mark.parametrize(
-    ("options", "expected"),
+    ("rows", "options", "expected"),
     [
-        ({}, [0, 0, 0, 0.1, 0.1]),
-        ({"last_planes": 0.0}, [0] * 5),
-        ({"last_tuning": 0.0}, [0, 0, 0, 0.1, 0.1]),
+        (1, {}, [0, 0, 0, 0.1, 0.1]),
+        (1, {"last_planes": 0.0}, [0] * 5),
+        (1, {"last_tuning": 0.0}, [0, 0, 0, 0.1, 0.1]),
+        (1, {"planes_hidden": 0.2}, [0] * 5),
+        (0, {}, [0] * 5),
+        (0, {"planes_hidden": 0.0}, [0, 0, 0, 0.1, 0.1]),
     ],
 )
-def test_walls_are_held_to_be_flat_in_the_last_passes(broken, monkeypatch, options, expected):
-    """Before these, the path may be off by more than a plane is wide."""
+def test_walls_are_held_to_be_flat_in_the_last_passes(broken, monkeypatch, rows, options, expected):
+    """Before these, the path may be off by more than a plane is wide.
+
+    And where so many rows of each picture, or none, are hidden by a mask.
+    """
     backend, _ = broken(**{"passes": [1] * 5, "last_planes": 0.1, **options})
+    store = backend.optimiser.store
+    assert 0.05 < rows / store.grid.height < 0.2 or not rows
+    store["unmasked"][: len(store), :rows] = 0.0
     heard = []
     monkeypatch.setattr(
         backend.optimiser,
