@@ -82,6 +82,13 @@ class MotionFilterConfig:
         ge=0,
         le=1,
     )
+    movable_nearer: float = opt(
+        1.0,
+        "how much nearer keyframes come for the share of a picture that is set aside: `threshold` "
+        "times one less that share (a half at most) times this (0: no nearer)",
+        ge=0,
+        le=1,
+    )
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
         0.4,

@@ -76,7 +76,7 @@ class Backend:
         wide, anew = self._begins_wide(), False
         for number, updates in enumerate(options.passes):
             solver, prior = self._solver(number, wide), self._prior(number)
-            learns = self.learn and self._is_narrow(number, wide)
+            learns = self.learn and (number > 0 or number == len(options.passes) - 1)
             if learns and not anew:
                 self.optimiser.begin_anew()
                 anew = True

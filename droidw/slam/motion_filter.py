@@ -22,6 +22,9 @@ T = TypeVar("T")
 
 __all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead"]
 
+# Most of a picture is taken to stand still, whatever could move.
+_MOST_HIDDEN = 0.5
+
 
 @dataclass(frozen=True)
 class Encoded:
@@ -82,6 +85,7 @@ class MotionFilter:
         self._correspondence = correspondence
         self._options = options
         self._reference: Encoded | None = None
+        self._threshold = options.threshold
         # Frames are counted from here; and the candidate of which the window has yet to decide.
         self._last_index = 0
         self._open: int | None = None
@@ -97,7 +101,7 @@ class MotionFilter:
         motion = self._correspondence.motion(self._reference.payload, current.payload)
         options = self._options
         forced = options.force_every > 0 and self._gap(current.frame.index) >= options.force_every
-        keep = motion.flow > options.threshold
+        keep = motion.flow > self._threshold
         if motion.matched < options.min_matched and motion.matched >= options.lost_below:
             keep = True
         elif motion.matched < options.lost_below:
@@ -113,8 +117,11 @@ class MotionFilter:
     def set_aside(self, current: Encoded, cells: Tensor) -> None:
         """What may move by itself in the frame just kept, bool [h,w], is not motion of a picture.
 
-        Only of a correspondence that has `aside`.
+        And the next keyframe comes nearer, as what is hidden tells nothing. Only of a
+        correspondence that has `aside`.
         """
+        share = min(float(cells.float().mean()), _MOST_HIDDEN)
+        self._threshold = self._options.threshold * (1.0 - self._options.movable_nearer * share)
         payload = self._correspondence.aside(current.payload, cells)  # type: ignore[attr-defined]
         self._reference = replace(current, payload=payload)
 
@@ -146,6 +153,7 @@ class MotionFilter:
 
     def _accept(self, current: Encoded, forced: bool) -> None:
         self._reference = current
+        self._threshold = self._options.threshold
         self._lost = 0
         with self._window:
             if forced:  # the window may not drop it

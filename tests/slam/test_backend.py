@@ -286,11 +286,11 @@ def test_the_focal_length_is_looked_for_after_the_first_pass_that_is_not_wide(
 @pytest.mark.parametrize(
     ("learn", "in_all", "options", "expected"),
     [
-        # neither in the wide pass nor in that before the focal length
-        (True, False, {}, [False, False, "anew", True, True]),
+        # not in the first pass, which mends the path
+        (True, False, {}, [False, "anew", True, True, True]),
         (True, False, {"wide_start": 1.0}, [False, "anew", True, True, True]),
         (True, False, {"passes": [1]}, ["anew", True]),
-        (True, True, {}, [True, True, "anew", True, True]),
+        (True, True, {}, [True, "anew", True, True, True]),
         (False, False, {}, [False] * 4),
     ],
 )

@@ -94,6 +94,41 @@ def test_what_is_set_aside_of_a_keyframe_holds_until_the_next():
     judge = MotionFilter(table, MotionFilterConfig())
     frames = [Encoded(Frame(k, k / 30, blank, blank), k) for k in range(4)]
     assert judge.judge(frames[0]).keep
-    judge.set_aside(frames[0], "cells")
+    cells = torch.zeros(2, 2, dtype=torch.bool)
+    judge.set_aside(frames[0], cells)
     assert [judge.judge(frame).keep for frame in frames[1:]] == [False, True, False]
-    assert table.asked == [(0, "cells"), (0, "cells"), 2]
+    assert table.asked == [(0, cells), (0, cells), 2]
+
+
+class Moving(Counting):
+    """Every picture moves by so much."""
+
+    def __init__(self, flow):
+        super().__init__()
+        self.flow = flow
+
+    def motion(self, reference, current):
+        return Motion(self.flow, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("aside", "nearer", "limit"),
+    [(0, 1.0, 1.25), (1, 1.0, 0.9375), (1, 0.5, 1.09375), (1, 0.0, 1.25), (3, 1.0, 0.625)],
+)
+def test_keyframes_come_nearer_where_something_is_set_aside(aside, nearer, limit):
+    """By the share of four cells, of half of them at most, and until the next one is taken."""
+    cells, blank = torch.arange(4).view(2, 2) < aside, torch.zeros(0)
+    frames = [Encoded(Frame(k, k / 30, blank, blank), k) for k in range(4)]
+    for flow, keeps in ((limit - 0.01, False), (limit + 0.01, True)):
+        judge = MotionFilter(Moving(flow), MotionFilterConfig(movable_nearer=nearer))
+        judge.judge(frames[0])
+        judge.set_aside(frames[0], cells)
+        assert judge.judge(frames[1]).keep == keeps
+
+    moving = Moving(1.3)
+    judge = MotionFilter(moving, MotionFilterConfig(movable_nearer=nearer))
+    judge.judge(frames[0])
+    judge.set_aside(frames[0], cells)
+    assert judge.judge(frames[1]).keep
+    moving.flow = 1.2
+    assert not judge.judge(frames[2]).keep
