@@ -84,8 +84,9 @@ class MotionFilterConfig:
     )
     movable_nearer: float = opt(
         1.0,
-        "how much nearer keyframes come for the share of a picture that is set aside: `threshold` "
-        "times one less that share (a half at most) times this (0: no nearer)",
+        "how much nearer keyframes come by the share of a picture that is set aside: `threshold` "
+        "and `frontend.keyframe_threshold` times one less that share, half at most, times this "
+        "(0: no nearer)",
         ge=0,
         le=1,
     )

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-__all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead"]
+__all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "nearness"]
 
 # Most of a picture is taken to stand still, whatever could move.
 _MOST_HIDDEN = 0.5
@@ -120,8 +120,8 @@ class MotionFilter:
         And the next keyframe comes nearer, as what is hidden tells nothing. Only of a
         correspondence that has `aside`.
         """
-        share = min(float(cells.float().mean()), _MOST_HIDDEN)
-        self._threshold = self._options.threshold * (1.0 - self._options.movable_nearer * share)
+        cells = cells.cpu()
+        self._threshold = self._options.threshold * float(nearness(cells, self._options))
         payload = self._correspondence.aside(current.payload, cells)  # type: ignore[attr-defined]
         self._reference = replace(current, payload=payload)
 
@@ -160,6 +160,11 @@ class MotionFilter:
                 self._last_index, self._open = current.frame.index, None
             else:
                 self._open = current.frame.index
+
+
+def nearness(cells: Tensor, options: MotionFilterConfig) -> Tensor:
+    """[] in [0,1], by what keyframes come nearer where cells, bool [h,w], are set aside."""
+    return 1.0 - options.movable_nearer * cells.float().mean().clamp_max(_MOST_HIDDEN)
 
 
 def look_ahead(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from droidw.config.schema import FrontendConfig
+from droidw.config.schema import FrontendConfig, MotionFilterConfig
 from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
 from droidw.graph.factors import FactorGraph
@@ -73,5 +73,24 @@ def test_a_near_keyframe_is_dropped_only_where_tracking_holds(measured, off, kee
     frontend = Frontend.__new__(Frontend)
     frontend.store, frontend.graph, frontend._drops = store, graph, 0
     frontend.options = FrontendConfig(keyframe_threshold=100.0, keep_below=keep_below)
+    frontend.config = SimpleNamespace(motion_filter=MotionFilterConfig())
     frontend.optimiser = SimpleNamespace(gates=lambda: gates)
+    assert frontend._redundant() == dropped
+
+
+@pytest.mark.parametrize(
+    ("rows", "above", "times", "dropped"),
+    [(0, 0.1, 1.01, 1), (2, 0.1, 1.49, None), (2, 0.1, 1.51, 1), (2, 0.0, 1.01, 1)],
+)
+def test_keyframes_are_nearer_where_something_can_move(measured, rows, above, times, dropped):
+    """Dropped below a distance, which is less by the share of six rows that can move."""
+    store, graph, gates = measured
+    frontend = Frontend.__new__(Frontend)
+    frontend.store, frontend.graph, frontend._drops = store, graph, 0
+    frontend.config = SimpleNamespace(motion_filter=MotionFilterConfig(movable_above=above))
+    frontend.optimiser = SimpleNamespace(gates=lambda: gates)
+    frontend.options = FrontendConfig()
+    distance = float(frontend._between(0, 1))
+    frontend.options.keyframe_threshold = times * distance
+    store["movable"][1, :rows] = 0.5
     assert frontend._redundant() == dropped
