@@ -70,6 +70,21 @@ def make():
     return make_problem
 
 
+def _cast(problem, dtype, device="cpu"):
+    moved = {
+        name: value.to(device, dtype if value.is_floating_point() else value.dtype)
+        for name, value in vars(problem).items()
+        if isinstance(value, torch.Tensor)
+    }
+    return replace(problem, **moved)
+
+
+@pytest.fixture
+def cast():
+    """A problem with another type of floating-point numbers, on a device."""
+    return _cast
+
+
 def torch_backend(**options):
     from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster, TorchBundleOptions
 

@@ -21,15 +21,6 @@ def tested(request, backends):
     return request.param, backends[request.param]
 
 
-def cast(problem, dtype, device="cpu"):
-    moved = {
-        name: value.to(device, dtype if value.is_floating_point() else value.dtype)
-        for name, value in vars(problem).items()
-        if isinstance(value, torch.Tensor)
-    }
-    return replace(problem, **moved)
-
-
 def random_problem(make, seed):
     """Sizes, edges, fixed and empty frames, priors, kernels and broken cells by chance.
 
@@ -75,7 +66,7 @@ def random_problem(make, seed):
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("seed", range(16))
-def test_one_step_on_a_random_problem(make, tested, seed, dtype):
+def test_one_step_on_a_random_problem(make, cast, tested, seed, dtype):
     name, backend = tested
     exact = cast(cast(random_problem(make, seed), dtype), torch.float64)  # what float32 can hold
     expected = TorchBundleAdjuster().step(exact)
@@ -115,7 +106,7 @@ def converged(adjuster, problem, steps=10):
 
 @pytest.mark.parametrize("cross", [False, True])
 @pytest.mark.parametrize("seed", range(2))
-def test_the_error_at_convergence(make, tested, seed, cross):
+def test_the_error_at_convergence(make, cast, tested, seed, cross):
     name, backend = tested
     p, T_cw, _ = make(
         n=7, h=12, w=16, reach=3, noise=0.02, seed=seed, lm=1e-4, ep=1e-3, cross=cross

@@ -211,18 +211,8 @@ def test_backends_agree(backend):
 
 
 @pytest.mark.gpu
-def test_a_gpu_agrees(backends):
-    problem = in_two_pieces(1.01)
-    names = [n for n, v in vars(problem).items() if isinstance(v, torch.Tensor)]
-    there = replace(
-        problem,
-        **{
-            n: getattr(problem, n).cuda().to(torch.float32)
-            if getattr(problem, n).is_floating_point()
-            else getattr(problem, n).cuda()
-            for n in names
-        },
-    )
+def test_a_gpu_agrees(backends, cast):
+    there = cast(in_two_pieces(1.01), torch.float32, "cuda")
     held = solve(backends["cuda"], there, 1e-4, 12, torch.ones_like(there.disps))
     assert scale_behind(held.T_cw.cpu()) == pytest.approx(1.0, abs=2e-3)
 
