@@ -87,7 +87,9 @@ def test_keyframes_are_nearer_where_something_can_move(measured, rows, above, ti
     store, graph, gates = measured
     frontend = Frontend.__new__(Frontend)
     frontend.store, frontend.graph, frontend._drops = store, graph, 0
-    frontend.config = SimpleNamespace(motion_filter=MotionFilterConfig(movable_above=above))
+    frontend.config = SimpleNamespace(
+        motion_filter=MotionFilterConfig(movable_above=above, movable_nearer=1.0)
+    )
     frontend.optimiser = SimpleNamespace(gates=lambda: gates)
     frontend.options = FrontendConfig()
     distance = float(frontend._between(0, 1))
