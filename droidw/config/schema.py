@@ -164,7 +164,7 @@ class BackendConfig:
     )
     last_slip: float = opt(0.5, "`global_solver.cauchy_slip` of those passes", ge=0)
     last_planes: float = opt(
-        0.01, "`global_solver.planes` of those passes, where `planes_hidden` is", ge=0
+        0.01, "`global_solver.planes` of those passes, if `planes_hidden` is reached", ge=0
     )
     planes_hidden: float = opt(
         0.05,
@@ -213,7 +213,7 @@ class BackendConfig:
         "many matches with a usual residual (0: not at all)",
         ge=0,
     )
-    learn: bool = opt(True, "let uncertainty learn anew in the last passes, from a mended path")
+    learn: bool = opt(True, "let uncertainty learn anew after the first pass, from a mended path")
     relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
     turns: int = opt(
         3,

@@ -37,7 +37,7 @@ class Backend:
     Args:
         focal_known: the focal length is a calibration, not a guess.
         motion_prior: how much steady motion counts in the first pass, as `backend.motion_prior`.
-        learn: uncertainty learns anew in the last passes, as `backend.learn`.
+        learn: uncertainty learns anew after the first pass, as `backend.learn`.
     Attributes:
         focal: what the search for a better focal length found, None without one.
         agreement: share of what was measured last that agrees with poses and depths; NaN before.
