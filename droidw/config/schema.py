@@ -83,7 +83,7 @@ class MotionFilterConfig:
         le=1,
     )
     movable_nearer: float = opt(
-        0.5,
+        0.0,
         "how much nearer keyframes come by the share of a picture that is set aside: `threshold` "
         "and `frontend.keyframe_threshold` times one less that share, half at most, times this "
         "(0: no nearer)",
