@@ -19,8 +19,6 @@ from droidw.slam.motion_filter import nearness
 from droidw.slam.starts import mirrored, plane_starts
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from droidw.config.schema import DroidwConfig, PhaseConfig, SolverConfig
     from droidw.slam.optimise import Optimiser
 
@@ -243,19 +241,19 @@ class Frontend:
             if count < 5:
                 return None
             near = self._between(count - 4, count - 2) < 2 * options.keyframe_threshold
-            return count - 3 if bool(near) else None
+            return count - 3 if near else None
         if self._drops >= _MOST_DROPS:
             return None
         limit = options.keyframe_threshold * self._nearness(count - 1)
         near = self._between(count - 2, count - 1) < limit
-        return count - 1 if bool(near) and not self._doubtful() else None
+        return count - 1 if near and not self._doubtful() else None
 
-    def _nearness(self, number: int) -> Tensor:
+    def _nearness(self, number: int) -> float:
         """By what a keyframe may be nearer to the one before, for what can move in it."""
         options = self.config.motion_filter
-        movable = self.store["movable"][number]
-        above = options.movable_above
-        return nearness(movable > above if above > 0 else movable > 1, options)
+        if options.movable_above == 0 or options.movable_nearer == 0:
+            return 1.0
+        return nearness(self.store["movable"][number] > options.movable_above, options)
 
     def _doubtful(self) -> bool:
         """Whether too little of what the newest keyframe measured agrees with its pose.
@@ -269,10 +267,10 @@ class Frontend:
         rows = [r for r in graph.select() if last in (graph.ii[r], graph.jj[r])]
         return explained_share(self.store, graph, rows, self.optimiser.gates()) < least
 
-    def _between(self, i: int, j: int) -> Tensor:
-        """[] frame distance of two keyframes."""
+    def _between(self, i: int, j: int) -> float:
+        """Frame distance of two keyframes."""
         pair = torch.tensor([i]), torch.tensor([j])
-        return self._distance(*pair, self.options.beta)[0]
+        return float(self._distance(*pair, self.options.beta)[0])
 
     def _first_free(self) -> int:
         """The oldest source of an active edge stays; everything after it is free."""

@@ -121,7 +121,7 @@ class MotionFilter:
         correspondence that has `aside`.
         """
         cells = cells.cpu()
-        self._threshold = self._options.threshold * float(nearness(cells, self._options))
+        self._threshold = self._options.threshold * nearness(cells, self._options)
         payload = self._correspondence.aside(current.payload, cells)  # type: ignore[attr-defined]
         self._reference = replace(current, payload=payload)
 
@@ -162,9 +162,9 @@ class MotionFilter:
                 self._open = current.frame.index
 
 
-def nearness(cells: Tensor, options: MotionFilterConfig) -> Tensor:
-    """[] in [0,1], by what keyframes come nearer where cells, bool [h,w], are set aside."""
-    return 1.0 - options.movable_nearer * cells.float().mean().clamp_max(_MOST_HIDDEN)
+def nearness(cells: Tensor, options: MotionFilterConfig) -> float:
+    """In [0,1], by what keyframes come nearer where cells, bool [h,w], are set aside."""
+    return 1.0 - options.movable_nearer * min(float(cells.float().mean()), _MOST_HIDDEN)
 
 
 def look_ahead(

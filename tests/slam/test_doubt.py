@@ -92,7 +92,7 @@ def test_keyframes_are_nearer_where_something_can_move(measured, rows, above, ti
     )
     frontend.optimiser = SimpleNamespace(gates=lambda: gates)
     frontend.options = FrontendConfig()
-    distance = float(frontend._between(0, 1))
+    distance = frontend._between(0, 1)
     frontend.options.keyframe_threshold = times * distance
     store["movable"][1, :rows] = 0.5
     assert frontend._redundant() == dropped
