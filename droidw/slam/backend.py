@@ -15,6 +15,7 @@ from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import backend_edges, frontend_edges
 from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
+from droidw.slam.motion_filter import spans
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -205,6 +206,9 @@ class Backend:
             )
         distance = np.full((count, count), np.inf)
         distance[ii.numpy(), jj.numpy()] = torch.cat(near).double().numpy()
+        steps = spans(store["movable"], self.config.motion_filter)
+        # where keyframes are near to one another, more of them are as far apart as elsewhere
+        most = int(options.factors_per_keyframe * (1 / steps).sum())
         if options.nms_shape == "diamond":
             return frontend_edges(
                 distance,
@@ -214,12 +218,14 @@ class Backend:
                 radius=options.radius,
                 nms=options.nms,
                 threshold=options.threshold,
-                max_factors=options.factors_per_keyframe * count,
+                max_factors=most,
+                spans=steps,
             )
         return backend_edges(
             distance,
             radius=options.radius,
             nms=options.nms,
             threshold=options.threshold,
-            max_factors=options.factors_per_keyframe * count,
+            max_factors=most,
+            spans=steps,
         )

@@ -15,7 +15,7 @@ from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import frontend_edges, neighbour_edges
 from droidw.slam.doubt import explained_share
 from droidw.slam.locate import carry_depth, locate
-from droidw.slam.motion_filter import nearness
+from droidw.slam.motion_filter import spans
 from droidw.slam.starts import mirrored, plane_starts
 
 if TYPE_CHECKING:
@@ -244,16 +244,10 @@ class Frontend:
             return count - 3 if near else None
         if self._drops >= _MOST_DROPS:
             return None
-        limit = options.keyframe_threshold * self._nearness(count - 1)
+        step = spans(self.store["movable"][count - 1 : count], self.config.motion_filter)
+        limit = options.keyframe_threshold * float(step[0])
         near = self._between(count - 2, count - 1) < limit
         return count - 1 if near and not self._doubtful() else None
-
-    def _nearness(self, number: int) -> float:
-        """By what a keyframe may be nearer to the one before, for what can move in it."""
-        options = self.config.motion_filter
-        if options.movable_above == 0 or options.movable_nearer == 0:
-            return 1.0
-        return nearness(self.store["movable"][number] > options.movable_above, options)
 
     def _doubtful(self) -> bool:
         """Whether too little of what the newest keyframe measured agrees with its pose.

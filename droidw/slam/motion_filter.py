@@ -9,9 +9,12 @@ from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
+
 from droidw.interfaces.correspondence import Motion
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
     from torch import Tensor
 
     from droidw.config.schema import MotionFilterConfig
@@ -20,7 +23,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-__all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "nearness"]
+__all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "nearness", "spans"]
 
 # Most of a picture is taken to stand still, whatever could move.
 _MOST_HIDDEN = 0.5
@@ -121,7 +124,7 @@ class MotionFilter:
         correspondence that has `aside`.
         """
         cells = cells.cpu()
-        self._threshold = self._options.threshold * nearness(cells, self._options)
+        self._threshold = self._options.threshold * float(nearness(cells, self._options))
         payload = self._correspondence.aside(current.payload, cells)  # type: ignore[attr-defined]
         self._reference = replace(current, payload=payload)
 
@@ -162,9 +165,18 @@ class MotionFilter:
                 self._open = current.frame.index
 
 
-def nearness(cells: Tensor, options: MotionFilterConfig) -> float:
-    """In [0,1], by what keyframes come nearer where cells, bool [h,w], are set aside."""
-    return 1.0 - options.movable_nearer * min(float(cells.float().mean()), _MOST_HIDDEN)
+def nearness(cells: Tensor, options: MotionFilterConfig) -> npt.NDArray[np.float64]:
+    """In [0,1], by what keyframes come nearer where cells, bool [...,h,w], are set aside, [...]."""
+    share = cells.float().mean(dim=(-2, -1)).double().cpu().numpy()
+    near: npt.NDArray[np.float64] = 1.0 - options.movable_nearer * np.minimum(share, _MOST_HIDDEN)
+    return near
+
+
+def spans(movable: Tensor, options: MotionFilterConfig) -> npt.NDArray[np.float64]:
+    """What part of a usual step leads to each keyframe, [N], by what can move in it, [N,h,w]."""
+    if options.movable_above == 0 or options.movable_nearer == 0:
+        return np.ones(len(movable))
+    return nearness(movable > options.movable_above, options)
 
 
 def look_ahead(

@@ -347,6 +347,20 @@ def test_near_keyframes_keep_their_edges(broken):
     assert len(edges["diamond"]) < COUNT * (COUNT - 1) / 2  # far ones are still thinned
 
 
+@pytest.mark.parametrize(("moves", "nearer", "more"), [(0, 1, False), (4, 1, True), (4, 0, False)])
+def test_nearer_keyframes_have_more_edges(broken, moves, nearer, more):
+    """Their number is limited by what they span: by twice as many where steps are half as long."""
+    counts = []
+    for movable in (0, moves):
+        backend, _ = broken(factors_per_keyframe=4, threshold=1000.0)
+        backend.config.motion_filter.movable_nearer = float(nearer)
+        backend.optimiser.store["movable"][:, :movable] = 0.5  # of eight rows
+        counts.append(len(backend.edges()))
+    assert (counts[1] > counts[0]) is more
+    assert 4 * COUNT <= counts[0] <= 4 * COUNT + 2
+    assert counts[1] <= (8 if more else 4) * COUNT + 2
+
+
 def test_cells_that_say_little_do_not_hold_on_to_the_scale_of_a_piece(arc, waves, stored):
     """Half of the path is a tenth too large; damped as in the window, depths would keep it so."""
     grid, intrinsics = Grid(H, W, 8, 3.5), torch.tensor([82.0, 82.0, 47.5, 31.5])
