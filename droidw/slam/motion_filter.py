@@ -25,8 +25,9 @@ T = TypeVar("T")
 
 __all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "nearness", "spans"]
 
-# Most of a picture is taken to stand still, whatever could move.
-_MOST_HIDDEN = 0.5
+# Most of a picture is taken to stand still, whatever could move; and of pictures in which nothing
+# does, up to a tenth is taken for what can.
+_LEAST_HIDDEN, _MOST_HIDDEN = 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,8 @@ class MotionFilter:
 def nearness(cells: Tensor, options: MotionFilterConfig) -> npt.NDArray[np.float64]:
     """In [0,1], by what keyframes come nearer where cells, bool [...,h,w], are set aside, [...]."""
     share = cells.float().mean(dim=(-2, -1)).double().cpu().numpy()
-    near: npt.NDArray[np.float64] = 1.0 - options.movable_nearer * np.minimum(share, _MOST_HIDDEN)
+    share = np.where(share < _LEAST_HIDDEN, 0.0, np.minimum(share, _MOST_HIDDEN))
+    near: npt.NDArray[np.float64] = 1.0 - options.movable_nearer * share
     return near
 
 

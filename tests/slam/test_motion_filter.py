@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ import torch
 from droidw.config.schema import MotionFilterConfig
 from droidw.interfaces.correspondence import Motion
 from droidw.slam.frame import Frame
-from droidw.slam.motion_filter import Encoded, MotionFilter, look_ahead
+from droidw.slam.motion_filter import Encoded, MotionFilter, look_ahead, spans
 
 COUNT = 60
 MOVED = {k for k in range(COUNT) if k % 7 in (3, 4)}
@@ -109,6 +110,17 @@ class Moving(Counting):
 
     def motion(self, reference, current):
         return Motion(self.flow, 1.0)
+
+
+@pytest.mark.parametrize(("aside", "near"), [(0, 1.0), (1, 1.0), (2, 0.9), (10, 0.5), (20, 0.5)])
+def test_a_few_cells_bring_no_keyframe_nearer(aside, near):
+    """Of twenty: less than a tenth, which a classifier may see where nothing moves."""
+    movable = (torch.arange(20).view(1, 4, 5) < aside) * 0.2
+    options = MotionFilterConfig(movable_nearer=1.0)
+    assert spans(movable, options) == pytest.approx([near])
+    assert spans(movable, replace(options, movable_nearer=0.5)) == pytest.approx([(1 + near) / 2])
+    assert spans(movable, replace(options, movable_nearer=0.0)) == [1.0]
+    assert spans(movable, replace(options, movable_above=0.2)) == [1.0]
 
 
 @pytest.mark.parametrize(
