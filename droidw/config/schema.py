@@ -176,20 +176,15 @@ class BackendConfig:
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)
-    nms: int = opt(
-        3,
-        "suppression radius around chosen edges, in keyframes; in more of them where "
-        "`motion_filter.movable_nearer` brings them nearer",
-        ge=0,
-    )
+    nms: int = opt(3, "suppression radius around chosen edges", ge=0)
     nms_shape: Literal["square", "diamond"] = opt(
         "diamond", "what a chosen edge suppresses; diamond: little near the diagonal"
     )
     normalize: bool = opt(False, "mean disparity becomes 1 before passes without a depth prior")
     factors_per_keyframe: int = opt(
         10,
-        "directed edges per keyframe at most; more where `motion_filter.movable_nearer` brings "
-        "keyframes nearer, so that edges reach as far",
+        "directed edges per keyframe at most; as many more as `motion_filter.movable_nearer` "
+        "brings keyframes nearer",
         ge=2,
     )
     backwards_below: float = opt(

@@ -219,7 +219,6 @@ class Backend:
                 nms=options.nms,
                 threshold=options.threshold,
                 max_factors=most,
-                spans=steps,
             )
         return backend_edges(
             distance,
@@ -227,5 +226,4 @@ class Backend:
             nms=options.nms,
             threshold=options.threshold,
             max_factors=most,
-            spans=steps,
         )
