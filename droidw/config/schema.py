@@ -176,7 +176,12 @@ class BackendConfig:
     beta: float = opt(0.75, "mix of full and translational flow in the frame distance", ge=0, le=1)
     threshold: float = opt(25.0, "largest frame distance of an edge, in cells", gt=0)
     radius: int = opt(1, "neighbours always linked", ge=1)
-    nms: int = opt(3, "suppression radius around chosen edges", ge=0)
+    nms: int = opt(
+        3,
+        "suppression radius around chosen edges, in keyframes; in more of them where "
+        "`motion_filter.movable_nearer` brings them nearer",
+        ge=0,
+    )
     nms_shape: Literal["square", "diamond"] = opt(
         "diamond", "what a chosen edge suppresses; diamond: little near the diagonal"
     )

@@ -12,6 +12,9 @@ __all__ = ["backend_edges", "frontend_edges", "neighbour_edges"]
 Pair = tuple[int, int]
 Distances = npt.NDArray[np.float64]
 
+# Sums of steps are this much off at most: 0.7 + 0.7 + 0.6 are two.
+_ROUNDING = 1e-6
+
 
 def neighbour_edges(count: int, radius: int) -> list[Pair]:
     """All ordered pairs with 1 <= |i - j| <= radius among `count` keyframes."""
@@ -32,6 +35,18 @@ def _ascending(d: Distances, limit: float) -> list[tuple[int, int]]:
     return list(zip(rows.tolist(), cols.tolist(), strict=True))
 
 
+def _positions(count: int, spans: Distances | None) -> Distances:
+    """How many usual steps lead to each of `count` keyframes, [count]."""
+    return np.cumsum(np.ones(count) if spans is None else spans)
+
+
+def _within(at: Distances, centre: float, reach: float) -> slice:
+    """The part of ascending positions that is so near."""
+    low = np.searchsorted(at, centre - reach - _ROUNDING)
+    high = np.searchsorted(at, centre + reach + _ROUNDING, side="right")
+    return slice(int(low), int(high))
+
+
 def frontend_edges(
     distance: Distances,
     first_i: int,
@@ -42,6 +57,7 @@ def frontend_edges(
     nms: int,
     threshold: float,
     max_factors: int,
+    spans: Distances | None = None,
 ) -> list[Pair]:
     """Edges of the sliding window, both directions of each pair.
 
@@ -53,21 +69,22 @@ def frontend_edges(
         nms: largest L1 radius of the suppression.
         threshold: largest distance of an edge that is not forced.
         max_factors: stop when this many directed edges are proposed.
+        spans: [K], what part of a usual step leads to each keyframe: the suppression counts in
+            usual steps; None where all are.
     """
     d = distance.astype(np.float64, copy=True)
     rows, cols = d.shape
     i_of = np.arange(first_i, first_i + rows)[:, None]
     j_of = np.arange(first_j, first_j + cols)[None, :]
     d[(j_of > i_of - radius) | (d > 100.0)] = np.inf
+    at = _positions(max(first_i + rows, first_j + cols), spans)
+    at_rows, at_cols = at[first_i : first_i + rows], at[first_j : first_j + cols]
 
     def suppress(i: int, j: int) -> None:
-        reach = max(min(abs(i - j) - 2, nms), 0)
-        for di in range(-reach, reach + 1):
-            for dj in range(-reach, reach + 1):
-                if abs(di) + abs(dj) <= reach:
-                    a, b = i + di - first_i, j + dj - first_j
-                    if 0 <= a < rows and 0 <= b < cols:
-                        d[a, b] = np.inf
+        reach = max(min(abs(at[i] - at[j]) - 2, nms), 0.0)
+        a, b = _within(at_rows, at[i], reach), _within(at_cols, at[j], reach)
+        away = abs(at_rows[a] - at[i])[:, None] + abs(at_cols[b] - at[j])[None, :]
+        d[a, b][away <= reach + _ROUNDING] = np.inf
 
     for i, j in existing:
         suppress(i, j)
@@ -90,7 +107,13 @@ def frontend_edges(
 
 
 def backend_edges(
-    distance: Distances, *, radius: int, nms: int, threshold: float, max_factors: int
+    distance: Distances,
+    *,
+    radius: int,
+    nms: int,
+    threshold: float,
+    max_factors: int,
+    spans: Distances | None = None,
 ) -> list[Pair]:
     """Edges of a global graph over N keyframes, both directions of each pair.
 
@@ -100,6 +123,7 @@ def backend_edges(
         nms: half width of the square that a chosen edge suppresses.
         threshold: largest distance of an edge that is not forced.
         max_factors: stop when this many directed edges are proposed.
+        spans: as in `frontend_edges`, [N].
     """
     n = distance.shape[0]
     d = distance.astype(np.float64, copy=True)
@@ -109,11 +133,12 @@ def backend_edges(
         for j in range(max(i - radius - 1, 0), i):
             edges += [(i, j), (j, i)]
             d[i, j] = np.inf
+    at = _positions(n, spans)
     for i, j in _ascending(d, threshold):
         if len(edges) > max_factors:
             break
         if not np.isfinite(d[i, j]):
             continue
         edges += [(i, j), (j, i)]
-        d[max(i - nms, 0) : i + nms + 1, max(j - nms, 0) : j + nms + 1] = np.inf
+        d[_within(at, at[i], nms), _within(at, at[j], nms)] = np.inf
     return edges

@@ -219,6 +219,7 @@ class Backend:
                 nms=options.nms,
                 threshold=options.threshold,
                 max_factors=most,
+                spans=steps,
             )
         return backend_edges(
             distance,
@@ -226,4 +227,5 @@ class Backend:
             nms=options.nms,
             threshold=options.threshold,
             max_factors=most,
+            spans=steps,
         )

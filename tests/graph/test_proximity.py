@@ -89,3 +89,35 @@ def test_global_ties_go_by_index_and_stop_in_time():
     assert 90 < len(edges) <= 92
     chosen = [e for e in edges if e[0] - e[1] > 2]
     assert chosen == sorted(chosen)
+
+
+@pytest.mark.parametrize("square", [False, True], ids=["diamond", "square"])
+def test_half_steps_suppress_twice_as_many(square):
+    """As if every other keyframe were not there: suppression counts steps, not keyframes."""
+    count, options = 20, {"radius": 1, "nms": 2, "threshold": 25.0, "max_factors": 1000}
+    d = np.full((2 * count, 2 * count), np.inf)
+    d[::2, ::2] = np.random.default_rng(1).uniform(0, 20, (count, count))
+    linked = np.subtract.outer(np.arange(2 * count), np.arange(2 * count)) <= 4
+    d[linked] = np.inf
+
+    def chosen(d, spans=None):
+        if square:
+            edges = backend_edges(d, spans=spans, **options)
+        else:
+            edges = frontend_edges(d, 0, 0, (), spans=spans, **options)
+        return {(i, j) for i, j in edges if np.isfinite(d[i, j])}
+
+    every_other = {(2 * i, 2 * j) for i, j in chosen(d[::2, ::2])}
+    half = chosen(d, np.full(2 * count, 0.5))
+    assert half and half == every_other
+    assert len(chosen(d)) > len(half)
+
+
+def test_steps_are_summed_without_gaps():
+    """Ten tenths are one step, whatever rounding makes of their sum."""
+    d = np.full((40, 40), np.inf)
+    d[30, 5], d[30, 15] = 1.0, 2.0
+    options = {"radius": 1, "nms": 1, "threshold": 25.0, "max_factors": 1000}
+    edges = backend_edges(d, spans=np.full(40, 0.1), **options)
+    assert (30, 5) in edges and (30, 15) not in edges
+    assert (30, 15) in backend_edges(d, spans=np.full(40, 0.11), **options)
