@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -35,16 +36,16 @@ def _ascending(d: Distances, limit: float) -> list[tuple[int, int]]:
     return list(zip(rows.tolist(), cols.tolist(), strict=True))
 
 
-def _positions(count: int, spans: Distances | None) -> Distances:
-    """How many usual steps lead to each of `count` keyframes, [count]."""
-    return np.cumsum(np.ones(count) if spans is None else spans)
+def _positions(count: int, spans: Distances | None) -> list[float]:
+    """How many usual steps lead to each of `count` keyframes."""
+    positions: list[float] = np.cumsum(np.ones(count) if spans is None else spans).tolist()
+    return positions
 
 
-def _within(at: Distances, centre: float, reach: float) -> slice:
+def _within(at: Sequence[float], centre: float, reach: float) -> slice:
     """The part of ascending positions that is so near."""
-    low = np.searchsorted(at, centre - reach - _ROUNDING)
-    high = np.searchsorted(at, centre + reach + _ROUNDING, side="right")
-    return slice(int(low), int(high))
+    low = bisect_left(at, centre - reach - _ROUNDING)
+    return slice(low, bisect_right(at, centre + reach + _ROUNDING))
 
 
 def frontend_edges(
@@ -82,9 +83,10 @@ def frontend_edges(
 
     def suppress(i: int, j: int) -> None:
         reach = max(min(abs(at[i] - at[j]) - 2, nms), 0.0)
-        a, b = _within(at_rows, at[i], reach), _within(at_cols, at[j], reach)
-        away = abs(at_rows[a] - at[i])[:, None] + abs(at_cols[b] - at[j])[None, :]
-        d[a, b][away <= reach + _ROUNDING] = np.inf
+        near = _within(at_rows, at[i], reach)
+        for a in range(near.start, near.stop):
+            left = reach - abs(at_rows[a] - at[i])
+            d[a, _within(at_cols, at[j], left)] = np.inf
 
     for i, j in existing:
         suppress(i, j)

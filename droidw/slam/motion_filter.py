@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-__all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "nearness", "spans"]
+__all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "spans"]
 
 # Most of a picture is taken to stand still, whatever could move; and of pictures in which nothing
 # does, up to a tenth is taken for what can.
