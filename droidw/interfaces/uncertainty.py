@@ -57,6 +57,8 @@ class UncertaintyView:
         gate: the weights in [0,1] that uncertainties [N,h,w] leave; None: all of it.
         calibrate: similarities of these features are to be brought to the scale on which
             thresholds are meant (docs/features.md); false: their cosine is taken as it is.
+        mended: poses and depths have been through a pass of global adjustment, and the model has
+            begun anew with them.
     """
 
     features: Tensor
@@ -73,6 +75,7 @@ class UncertaintyView:
     iteration: int = 0
     gate: Callable[[Tensor], Tensor] | None = None
     calibrate: bool = False
+    mended: bool = False
     host: Indices | None = None
 
     def indices(self) -> Indices:

@@ -26,8 +26,9 @@ T = TypeVar("T")
 __all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "spans"]
 
 # Most of a picture is taken to stand still, whatever could move; and of pictures in which nothing
-# does, up to a tenth is taken for what can.
-_LEAST_HIDDEN, _MOST_HIDDEN = 0.1, 0.5
+# does, up to a tenth is taken for what can. In between it counts little by little: no one cell
+# decides.
+_LEAST_HIDDEN, _PLAINLY_HIDDEN, _MOST_HIDDEN = 0.1, 0.3, 0.5
 
 
 @dataclass(frozen=True)
@@ -169,8 +170,9 @@ class MotionFilter:
 def nearness(cells: Tensor, options: MotionFilterConfig) -> npt.NDArray[np.float64]:
     """In [0,1], by what keyframes come nearer where cells, bool [...,h,w], are set aside, [...]."""
     share = cells.float().mean(dim=(-2, -1)).double().cpu().numpy()
-    share = np.where(share < _LEAST_HIDDEN, 0.0, np.minimum(share, _MOST_HIDDEN))
-    near: npt.NDArray[np.float64] = 1.0 - options.movable_nearer * share
+    counts = np.clip((share - _LEAST_HIDDEN) / (_PLAINLY_HIDDEN - _LEAST_HIDDEN), 0.0, 1.0)
+    hidden = counts * np.minimum(share, _MOST_HIDDEN)
+    near: npt.NDArray[np.float64] = 1.0 - options.movable_nearer * hidden
     return near
 
 

@@ -110,9 +110,8 @@ class Optimiser:
         self.begins = getattr(parts.uncertainty, "begins", False) and hasattr(
             parts.features, "movable"
         )
-        self.begun = self.anew = False
+        self.begun = self.anew = self.doubtful = False
         self._later = 1.0
-        self.doubtful = False
         self.points: tuple[PointMatches, float] | None = None
         self.iterations = 0
         self.reports: dict[str, int] = {}
@@ -381,6 +380,7 @@ class Optimiser:
             iteration=self.iterations,
             gate=self._gate,
             calibrate=self._calibrate,
+            mended=self.anew,
         )
 
     def _learn(

@@ -52,6 +52,19 @@ def test_factor_is_below_one_where_motion_agrees() -> None:
     assert broken == pytest.approx(1.0, abs=1e-6)
 
 
+def test_a_few_bad_matches_do_not_outweigh_those_that_agree() -> None:
+    residual = torch.zeros(4, 1, 3)
+    residual[0, 0, 0] = 50.0  # one of four
+    residual[1:, 0, 1] = 50.0  # three of four
+    ones, ii = torch.ones(4, 1, 3), torch.zeros(4, dtype=torch.int64)
+    found = residual_factor(residual, ones, ii, 1, 0.2, 0.9, smooth=1, each=True)[0, 0]
+    assert found.tolist() == pytest.approx([0.64, 1.07, 0.42], abs=0.02)
+    mean = residual_factor(residual, ones, ii, 1, 0.2, 0.9, smooth=0)[0, 0]
+    assert mean.tolist() == pytest.approx([1.27, 1.3, 0.4], abs=0.04)
+    none = residual_factor(residual, 0.0 * ones, ii, 1, 0.2, 0.9, smooth=1, each=True)
+    assert torch.allclose(none, torch.ones(1, 1, 3))
+
+
 def test_residuals_count_where_most_of_the_measured_motion_agrees() -> None:
     def believed(agreeing: int, least: float = 0.6) -> float:
         residual = torch.full((1, 1, 10), 50.0)
@@ -90,6 +103,29 @@ def test_residuals_change_what_is_written_and_not_what_is_learned(
     assert torch.allclose(ratio[:, :, 4:], torch.tensor(1.1), atol=0.01)
     smooth = maps(smooth=1)
     assert torch.allclose(smooth, box_mean(plain, 1), atol=1e-6)
+
+
+@EACH
+def test_once_the_path_is_mended_what_moves_need_not_agree(module: Any, started: Start) -> None:
+    """Three columns of seven disagree: too many to believe the rest, but for one that is closed."""
+
+    def maps(mended: bool, closed: int, **options: object) -> Tensor:
+        model = _model(module, residual_majority=0.7, **options)
+        view = replace(_measured(started(model)), mended=mended)
+        gate = torch.ones(view.disps.shape)
+        gate[:, :, 7 - closed :] = 0.0
+        model.update(replace(view, gate=lambda _: gate))
+        return view.uncertainty
+
+    plain = maps(True, 0)
+    for mended in (False, True):
+        assert torch.allclose(maps(mended, 3, residual_gain=0.3), plain, atol=1e-6)
+    assert torch.allclose(maps(False, 3, mended_gain=0.6), plain, atol=1e-6)
+    ratio = maps(True, 3, mended_gain=0.6) / plain
+    assert torch.allclose(ratio[:, :, :4], torch.tensor(0.6), atol=0.02)
+    assert torch.allclose(ratio[:, :, 4:], torch.tensor(1.2), atol=0.02)
+    some = maps(True, 0, mended_gain=0.6) / plain  # 0.57 agree: a third of the way from 0.5 to 0.7
+    assert torch.allclose(some[:, :, :4], torch.tensor(1 - 0.4 * 0.36), atol=0.02)
 
 
 @EACH

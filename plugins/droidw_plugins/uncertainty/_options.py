@@ -78,6 +78,15 @@ class ObjectiveOptions:
     residual_scale: float = field(
         default=0.2, metadata={"help": "residual in cells at which agreement is a half", "gt": 0}
     )
+    mended_gain: float = field(
+        default=0.0,
+        metadata={
+            "help": "residual_gain once global adjustment has mended the path; each measurement "
+            "then has its say by itself (0: as before)",
+            "ge": 0,
+            "le": 1,
+        },
+    )
     residual_majority: float = field(
         default=0.0,
         metadata={

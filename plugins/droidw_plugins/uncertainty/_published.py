@@ -36,7 +36,7 @@ def box_mean(maps: Tensor, radius: int) -> Tensor:
 
 def residual_factor(
     residual: Tensor, confidence: Tensor, ii: Tensor, frames: int, scale: float,
-    gain: float | Tensor, smooth: int,
+    gain: float | Tensor, smooth: int, each: bool = False,
 ) -> Tensor:  # fmt: skip
     """Factor [N,h,w] on the uncertainty of each cell: below one where measured motion agrees.
 
@@ -47,13 +47,19 @@ def residual_factor(
         residual: [E,h,w] distance of measured and predicted place, cells; 0 confidence where it
             means nothing. confidence: [E,h,w]. ii: [E] in [0, frames).
         smooth: radius over which r is averaged.
+        each: A is the mean of the agreements of the edges instead, of the cell alone. A few that
+            were measured badly do not outweigh those that agree, nor does what moves beside it.
     """
     weight, cut = _usable(residual, confidence)
     shape = (frames, *residual.shape[1:])
     total = weight.new_full(shape, _PRIOR).index_add_(0, ii, weight)
+    if each:
+        agrees = weight / (1.0 + (cut / scale).square_())
+        start = weight.new_full(shape, _PRIOR * _NEUTRAL)
+        return 1.0 + gain * (_NEUTRAL - start.index_add_(0, ii, agrees).div_(total))
     # At this residual the agreement is neutral.
-    start = _PRIOR * scale * (1.0 / _NEUTRAL - 1.0) ** 0.5
-    mean = weight.new_full(shape, start).index_add_(0, ii, weight * cut).div_(total)
+    start = weight.new_full(shape, _PRIOR * scale * (1.0 / _NEUTRAL - 1.0) ** 0.5)
+    mean = start.index_add_(0, ii, weight * cut).div_(total)
     agreement = 1.0 / (1.0 + (box_mean(mean, smooth) / scale).square_())
     return 1.0 + gain * (_NEUTRAL - agreement)
 
@@ -87,7 +93,7 @@ class Publisher:
     """Writes maps to the store; what was learned stays apart where the two differ.
 
     Args:
-        options: `smooth`, `learn_majority` and those named `residual_...` are read.
+        options: `smooth`, `learn_majority`, `mended_gain` and those named `residual_...` are read.
     Attributes:
         fields: none by default; else the map [h,w] as learned, and the factor of `residual_factor`
             as it was last found.
@@ -98,7 +104,7 @@ class Publisher:
 
     def __init__(self, options: ObjectiveOptions) -> None:
         self._options = options
-        self._apart = options.smooth > 0 or options.residual_gain > 0
+        self._apart = max(options.smooth, options.residual_gain, options.mended_gain) > 0
         fields = []
         if self._apart:
             fields = [StoreField(_LEARNED, ("h", "w")), StoreField(_FACTOR, ("h", "w"), fill=1.0)]
@@ -122,7 +128,9 @@ class Publisher:
         """Renew the factors of the frames that edges of the view start from."""
         options = self._options
         least = options.learn_majority if self.begun else 0.0
-        if max(options.residual_gain, least) == 0 or view.ii.numel() == 0:
+        mended = view.mended and options.mended_gain > 0
+        gain = options.mended_gain if mended else options.residual_gain
+        if max(gain, least) == 0 or view.ii.numel() == 0:
             return
         known = view.indices().ii
         first, last = min(known), max(known) + 1
@@ -131,21 +139,28 @@ class Publisher:
         apart = view.target.movedim(-1, 1) - xy.view(shape[0], 2, *shape[1:])
         residual = torch.linalg.vector_norm(apart, dim=1)
         confidence = view.confidence[..., :2].mean(-1) * valid.view(shape)
-        scale = options.residual_scale
+        counts = confidence
+        if (mended or least > 0) and view.gate is not None:
+            counts = confidence * view.gate(view.uncertainty)[view.ii]
+        scale, majority = options.residual_scale, options.residual_majority
         if least > 0:
-            gates = 1.0 if view.gate is None else view.gate(view.uncertainty)[view.ii]
-            self.believed = agreeing_majority(residual, confidence * gates, scale, least)
-        if options.residual_gain == 0:
+            self.believed = agreeing_majority(residual, counts, scale, least)
+        if gain == 0:
             return
-        believed = agreeing_majority(residual, confidence, scale, options.residual_majority)
+        if mended:
+            # What moves need not agree; and a path that was mended is lost more plainly.
+            believed = agreeing_majority(residual, counts, scale, max(majority - _RAMP, 0.0))
+        else:
+            believed = agreeing_majority(residual, confidence, scale, majority)
         factor = residual_factor(
             residual,
             confidence,
             view.ii - first,
             last - first,
             scale,
-            options.residual_gain * believed,
+            gain * believed,
             options.smooth,
+            each=mended,
         )
         starts = on_device(sorted(set(known)), view.disps.device)
         view.fields[_FACTOR][starts] = factor[starts - first]
