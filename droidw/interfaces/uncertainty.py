@@ -57,8 +57,8 @@ class UncertaintyView:
         gate: the weights in [0,1] that uncertainties [N,h,w] leave; None: all of it.
         calibrate: similarities of these features are to be brought to the scale on which
             thresholds are meant (docs/features.md); false: their cosine is taken as it is.
-        mended: poses and depths have been through a pass of global adjustment, and the model has
-            begun anew with them.
+        mended: poses and depths have been through a pass of global adjustment, after which a model
+            that `begins` has begun anew, and nothing has put them in doubt.
     """
 
     features: Tensor

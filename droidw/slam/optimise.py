@@ -380,7 +380,7 @@ class Optimiser:
             iteration=self.iterations,
             gate=self._gate,
             calibrate=self._calibrate,
-            mended=self.anew,
+            mended=self.anew and not self.doubtful,
         )
 
     def _learn(

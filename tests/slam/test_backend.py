@@ -330,6 +330,8 @@ def test_the_gate_goes_by_how_uncertainty_parts_once_it_learned_anew(
     assert not optimiser.view().mended
     optimiser.begin_anew()
     assert optimiser.view().mended
+    optimiser.doubtful = True
+    assert not optimiser.view().mended
     assert told == (["begin"] if begun else [])
     gates = optimiser.gates()
     assert gates[..., 0].unique() == (pytest.approx(1.0) if opens else pytest.approx(0.1, abs=0.1))
