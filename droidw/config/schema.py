@@ -84,8 +84,8 @@ class MotionFilterConfig:
     )
     movable_nearer: float = opt(
         1.0,
-        "how much nearer keyframes come by the share of a picture that is set aside, where that "
-        "is more than a tenth (from 0.3 on in full), half at most: `threshold` and "
+        "how much nearer keyframes come by the share of a picture that is set aside or masked, "
+        "where that is more than a tenth (from 0.3 on in full), half at most: `threshold` and "
         "`frontend.keyframe_threshold` times one less that share times this (0: no nearer)",
         ge=0,
         le=1,

@@ -206,7 +206,7 @@ class Backend:
             )
         distance = np.full((count, count), np.inf)
         distance[ii.numpy(), jj.numpy()] = torch.cat(near).double().numpy()
-        steps = spans(store["movable"], self.config.motion_filter)
+        steps = spans(store["movable"], store["unmasked"], self.config.motion_filter)
         # where keyframes are near to one another, more of them are as far apart as elsewhere
         most = int(options.factors_per_keyframe * (1 / steps).sum())
         if options.nms_shape == "diamond":

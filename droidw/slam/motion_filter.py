@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+import torch
 
 from droidw.interfaces.correspondence import Motion
 
@@ -23,12 +24,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-__all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "spans"]
+__all__ = ["MASKED", "Encoded", "MotionFilter", "Verdict", "look_ahead", "spans"]
 
 # Most of a picture is taken to stand still, whatever could move; and of pictures in which nothing
 # does, up to a tenth is taken for what can. In between it counts little by little: no one cell
 # decides.
 _LEAST_HIDDEN, _PLAINLY_HIDDEN, _MOST_HIDDEN = 0.1, 0.3, 0.5
+# Cells of which masks leave less than this are hidden.
+MASKED = 0.5
 
 
 @dataclass(frozen=True)
@@ -119,16 +122,24 @@ class MotionFilter:
             self._accept(current, forced)
         return Verdict(keep=keep or forced, forced=forced, motion=motion)
 
-    def set_aside(self, current: Encoded, cells: Tensor) -> None:
-        """What may move by itself in the frame just kept, bool [h,w], is not motion of a picture.
+    def set_aside(
+        self, current: Encoded, cells: Tensor | None, masked: Tensor | None = None
+    ) -> None:
+        """What may move by itself in the frame just kept is not motion of a picture.
 
-        And the next keyframe comes nearer, as what is hidden tells nothing. Only of a
-        correspondence that has `aside`.
+        And the next keyframe comes nearer, as what is hidden, by that or by a mask, tells nothing.
+
+        Args:
+            cells: bool [h,w], what may move; only of a correspondence that has `aside`. None:
+                nothing. masked: bool [h,w]; None: nothing.
         """
-        cells = cells.cpu()
-        self._threshold = self._options.threshold * float(nearness(cells, self._options))
-        payload = self._correspondence.aside(current.payload, cells)  # type: ignore[attr-defined]
-        self._reference = replace(current, payload=payload)
+        gone = [hidden.cpu() for hidden in (cells, masked) if hidden is not None]
+        if gone:
+            near = float(nearness(torch.stack(gone).any(dim=0), self._options))
+            self._threshold = self._options.threshold * near
+        if cells is not None:
+            payload = self._correspondence.aside(current.payload, gone[0])  # type: ignore[attr-defined]
+            self._reference = replace(current, payload=payload)
 
     def settled(self, index: int, kept: bool) -> None:
         """Whether candidate `index` has become a keyframe for good: frames are counted from it."""
@@ -168,7 +179,7 @@ class MotionFilter:
 
 
 def nearness(cells: Tensor, options: MotionFilterConfig) -> npt.NDArray[np.float64]:
-    """In [0,1], by what keyframes come nearer where cells, bool [...,h,w], are set aside, [...]."""
+    """In [0,1], by what keyframes come nearer where cells, bool [...,h,w], tell nothing, [...]."""
     share = cells.float().mean(dim=(-2, -1)).double().cpu().numpy()
     counts = np.clip((share - _LEAST_HIDDEN) / (_PLAINLY_HIDDEN - _LEAST_HIDDEN), 0.0, 1.0)
     hidden = counts * np.minimum(share, _MOST_HIDDEN)
@@ -176,11 +187,21 @@ def nearness(cells: Tensor, options: MotionFilterConfig) -> npt.NDArray[np.float
     return near
 
 
-def spans(movable: Tensor, options: MotionFilterConfig) -> npt.NDArray[np.float64]:
-    """What part of a usual step leads to each keyframe, [N], by what can move in it, [N,h,w]."""
-    if options.movable_above == 0 or options.movable_nearer == 0:
+def spans(
+    movable: Tensor, unmasked: Tensor, options: MotionFilterConfig
+) -> npt.NDArray[np.float64]:
+    """What part of a usual step leads to each keyframe, [N].
+
+    Args:
+        movable: [N,h,w] in [0,1], how much speaks for it that a cell can move.
+        unmasked: [N,h,w] in [0,1], what masks leave.
+    """
+    if options.movable_nearer == 0:
         return np.ones(len(movable))
-    return nearness(movable > options.movable_above, options)
+    gone = unmasked < MASKED
+    if options.movable_above > 0:
+        gone = gone | (movable > options.movable_above)
+    return nearness(gone, options)
 
 
 def look_ahead(

@@ -26,7 +26,7 @@ from droidw.slam.filler import Filler
 from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
-from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict, look_ahead
+from droidw.slam.motion_filter import MASKED, Encoded, MotionFilter, Verdict, look_ahead
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.records import Outcome, keyframe_records
 from droidw.slam.streams import Ahead, nbytes
@@ -183,14 +183,13 @@ class SlamSystem:
 
     def _with_movable(self, current: Encoded) -> Encoded:
         """What can move in a keyframe, where that is asked of every one."""
-        above = self.config.motion_filter.movable_above
+        above, frame = self.config.motion_filter.movable_above, current.frame
         aside = self._aside and above > 0
-        if not (self._renews or aside):
-            return current
-        movable = self._maps.movable(current.frame)
-        if aside:
-            self._filter.set_aside(current, movable > above)
-        return replace(current, movable=movable)
+        movable = self._maps.movable(frame) if self._renews or aside else None
+        cells = movable > above if aside and movable is not None else None
+        masked = None if frame.mask is None else self._maps.unmasked(frame) < MASKED
+        self._filter.set_aside(current, cells, masked)
+        return current if movable is None else replace(current, movable=movable)
 
     def _encode(self, frame: Frame) -> Encoded:
         with self.clock("encode"):

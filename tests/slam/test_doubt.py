@@ -82,7 +82,10 @@ def test_a_near_keyframe_is_dropped_only_where_tracking_holds(measured, off, kee
     ("rows", "above", "times", "dropped"),
     [(0, 0.1, 1.01, 1), (2, 0.1, 1.49, None), (2, 0.1, 1.51, 1), (2, 0.0, 1.01, 1)],
 )
-def test_keyframes_are_nearer_where_something_can_move(measured, rows, above, times, dropped):
+@pytest.mark.parametrize("masked", [False, True])
+def test_keyframes_are_nearer_where_something_is_hidden(
+    measured, rows, above, times, dropped, masked
+):
     """Dropped below a distance, which is less by the share of six rows that can move."""
     store, graph, gates = measured
     frontend = Frontend.__new__(Frontend)
@@ -94,5 +97,8 @@ def test_keyframes_are_nearer_where_something_can_move(measured, rows, above, ti
     frontend.options = FrontendConfig()
     distance = frontend._between(0, 1)
     frontend.options.keyframe_threshold = times * distance
-    store["movable"][1, :rows] = 0.5
+    if masked:  # whatever is asked of what can move
+        store["unmasked"][1, : rows if above else 0] = 0.0
+    else:
+        store["movable"][1, :rows] = 0.5
     assert frontend._redundant() == dropped

@@ -119,30 +119,44 @@ def test_a_few_cells_bring_no_keyframe_nearer(aside, near):
     """Of twenty: up to a tenth, which a classifier may see where nothing moves."""
     movable = (torch.arange(20).view(1, 4, 5) < aside) * 0.2
     options = MotionFilterConfig(movable_nearer=1.0)
-    assert spans(movable, options) == pytest.approx([near])
-    assert spans(movable, replace(options, movable_nearer=0.5)) == pytest.approx([(1 + near) / 2])
-    assert spans(movable, replace(options, movable_nearer=0.0)) == [1.0]
-    assert spans(movable, replace(options, movable_above=0.2)) == [1.0]
+    whole = torch.ones(1, 4, 5)
+    assert spans(movable, whole, options) == pytest.approx([near])
+    halved, none = replace(options, movable_nearer=0.5), replace(options, movable_nearer=0.0)
+    assert spans(movable, whole, halved) == pytest.approx([(1 + near) / 2])
+    assert spans(movable, whole, none) == [1.0]
+    for above in (0.0, 0.2):  # a mask counts all the same
+        some = replace(options, movable_above=above)
+        assert spans(movable, whole, some) == [1.0]
+        assert spans(movable, 1.0 - 5.0 * movable, some) == pytest.approx([near])
+    rest = torch.flip(whole - 5.0 * movable, (1, 2))
+    both = 1.0 - min(2 * (1 - near), 0.5) if aside >= 6 else None
+    assert both is None or spans(movable, rest, options) == pytest.approx([both])
 
 
 @pytest.mark.parametrize(
     ("aside", "nearer", "limit"),
     [(0, 1.0, 1.25), (1, 1.0, 1.015625), (1, 0.5, 1.1328125), (1, 0.0, 1.25), (3, 1.0, 0.625)],
 )
-def test_keyframes_come_nearer_where_something_is_set_aside(aside, nearer, limit):
+@pytest.mark.parametrize("how", ["set aside", "masked", "both"])
+def test_keyframes_come_nearer_where_something_is_hidden(aside, nearer, limit, how):
     """By the share of four cells, in full from 0.3, half at most, until the next one is taken."""
     cells, blank = torch.arange(4).view(2, 2) < aside, torch.zeros(0)
     frames = [Encoded(Frame(k, k / 30, blank, blank), k) for k in range(4)]
+    gone = {
+        "set aside": (cells,),
+        "masked": (None, cells),
+        "both": (torch.zeros_like(cells), cells),
+    }[how]
     for flow, keeps in ((limit - 0.01, False), (limit + 0.01, True)):
         judge = MotionFilter(Moving(flow), MotionFilterConfig(movable_nearer=nearer))
         judge.judge(frames[0])
-        judge.set_aside(frames[0], cells)
+        judge.set_aside(frames[0], *gone)
         assert judge.judge(frames[1]).keep == keeps
 
     moving = Moving(1.3)
     judge = MotionFilter(moving, MotionFilterConfig(movable_nearer=nearer))
     judge.judge(frames[0])
-    judge.set_aside(frames[0], cells)
+    judge.set_aside(frames[0], *gone)
     assert judge.judge(frames[1]).keep
     moving.flow = 1.2
     assert not judge.judge(frames[2]).keep
