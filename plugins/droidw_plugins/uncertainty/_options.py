@@ -81,8 +81,8 @@ class ObjectiveOptions:
     mended_gain: float = field(
         default=0.0,
         metadata={
-            "help": "residual_gain once global adjustment has mended the path; each measurement "
-            "then has its say by itself (0: as before)",
+            "help": "takes the place of residual_gain once global adjustment has mended the path; "
+            "each measurement then has its say by itself (0: residual_gain goes on)",
             "ge": 0,
             "le": 1,
         },

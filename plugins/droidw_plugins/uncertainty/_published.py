@@ -148,7 +148,8 @@ class Publisher:
         if gain == 0:
             return
         if mended:
-            # What moves need not agree; and a path that was mended is lost more plainly.
+            # What is closed need not agree. And less of the rest has to than while tracking: where
+            # matches are poor, two thirds of it are all that agrees with a right path.
             believed = agreeing_majority(residual, counts, scale, max(majority - _RAMP, 0.0))
         else:
             believed = agreeing_majority(residual, confidence, scale, majority)
