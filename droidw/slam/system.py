@@ -182,7 +182,7 @@ class SlamSystem:
         return replace(current, context=context, plain=plain)
 
     def _with_movable(self, current: Encoded) -> Encoded:
-        """What can move in a keyframe, where that is asked of every one."""
+        """What can move in a keyframe, where that is asked; the filter is told what is hidden."""
         above, frame = self.config.motion_filter.movable_above, current.frame
         aside = self._aside and above > 0
         movable = self._maps.movable(frame) if self._renews or aside else None
