@@ -133,6 +133,13 @@ class FrontendConfig:
         "damped: half of the last motion, median depth",
     )
     starts: bool = opt(True, "at initialisation, try several starts and keep what fits best")
+    surrounds: float = opt(
+        1.1,
+        "with `starts`, where nothing known can move: how many times farther over the picture "
+        "what agrees with a start must reach than with what was found, to be taken for what "
+        "stands still (0: not asked)",
+        ge=0,
+    )
     redundant: Literal["newest", "middle"] = opt(
         "newest",
         "which keyframe is dropped where too little moved: the newest, if near to the one before; "

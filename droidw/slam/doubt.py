@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from droidw.graph.factors import FactorGraph
     from droidw.graph.store import KeyframeStore
 
-__all__ = ["doubtful", "explained_share", "explained_weight"]
+__all__ = ["doubtful", "explained_reach", "explained_share", "explained_weight"]
 
 # Distance of measured and predicted place, in cells, at which they agree by half.
 _SCALE = 0.2
@@ -54,6 +55,41 @@ def explained_weight(
         rows, gates: as of `explained_share`.
     """
     return agreeing_weight(*_apart(store, graph, rows, gates), _SCALE).sum((1, 2))
+
+
+def explained_reach(
+    store: KeyframeStore, graph: FactorGraph, rows: list[int], gates: Tensor
+) -> float:
+    """Share of what was measured that agrees, times how far it reaches over the picture, in [0,1].
+
+    What the camera moves against surrounds what moves by itself. Where a large object has much of
+    what is matched, as much may agree with its motion as with the camera's, but on less of the
+    picture: the area of the ellipse that cells scatter in, as a share of that of all matched ones.
+
+    Args:
+        rows, gates: as of `explained_share`.
+    """
+    ii, _ = graph.index(rows)
+    matched = graph.confidence[rows][..., :2].mean(-1) * gates[ii]
+    agreeing = agreeing_weight(*_apart(store, graph, rows, gates), _SCALE).sum(0).double()
+    total = matched.sum(0).double()
+    share = float(agreeing.sum() / total.sum().clamp_min(1e-6))
+    around = _scatter(total)
+    return share * min(1.0, _scatter(agreeing) / around) if around > 0 else 0.0
+
+
+def _scatter(weight: Tensor) -> float:
+    """Area of the ellipse that weights [h,w] scatter in, up to a factor, in cells."""
+    height, width = weight.shape
+    y, x = torch.meshgrid(
+        torch.arange(height, dtype=weight.dtype, device=weight.device),
+        torch.arange(width, dtype=weight.dtype, device=weight.device),
+        indexing="ij",
+    )
+    place = torch.stack([x, y]).flatten(1)
+    part = weight.flatten() / weight.sum().clamp_min(1e-6)
+    off = place - (place * part).sum(1, keepdim=True)
+    return float(torch.linalg.det((off * part) @ off.T).clamp_min(0).sqrt())
 
 
 def _apart(

@@ -16,7 +16,7 @@ from droidw.graph.proximity import frontend_edges, neighbour_edges
 from droidw.slam.doubt import explained_share
 from droidw.slam.locate import carry_depth, locate
 from droidw.slam.motion_filter import spans
-from droidw.slam.starts import mirrored, plane_starts
+from droidw.slam.starts import Trials, mirrored
 
 if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig, PhaseConfig, SolverConfig
@@ -26,9 +26,6 @@ __all__ = ["Frontend"]
 
 # More keyframes than this in a row are never dropped.
 _MOST_DROPS = 5
-# Gauss-Newton steps of a start at initialisation, and the share of the energy that it must beat.
-_TRIAL_STEPS = 15
-_BETTER = 0.98
 # Share of the first keyframes that must be closed as what can move, for it to count as known.
 _KNOWN_MOVERS = 0.02
 # Gauss-Newton steps that bring a new keyframe to its predecessor.
@@ -91,8 +88,8 @@ class Frontend:
                 self._updates(phase, first_free=1)
             if phase == "init_again":
                 self.graph.grow_older(self.graph.select(), -updates)
-            if phase == "init" and options.starts and self._try_again():
-                self._updates(phase, first_free=1)
+            if phase == "init" and options.starts:
+                self._try_others()
             self._retire([r for r in self.graph.select() if self.graph.ii[r] < count - 4])
         self._recent = 4
         self._solver = self.config.solver
@@ -111,51 +108,28 @@ class Frontend:
 
     def _try_mirrored(self) -> None:
         """Leave the mirrored solution if that is where the first keyframes have converged to."""
-        store = self.store
+        store, trials = self.store, self._trials()
         found = store.T_cw.clone(), store.disps.clone()
         weigh = self._phase("init_blind").weigh
-        cost = self._settled_cost(weigh)
+        cost = trials.settled_cost(weigh)
         store.write(*mirrored(*found))
         self._updates("init_blind", first_free=1, informed=False)
-        if not self._settled_cost(weigh) < cost:
+        if not trials.settled_cost(weigh) < cost:
             store.write(*found)
 
-    def _try_again(self) -> bool:
-        """Start over from planes, now that uncertainty has its say, and keep what fits best.
+    def _try_others(self) -> None:
+        """Start over from planes, and go on from what fits best, or surrounds the rest."""
+        if self._trials().again():
+            self._updates("init", first_free=1)
+        kernel, least = self.config.solver, self.options.surrounds
+        if self._solver.cauchy > 0 or kernel.cauchy == 0 or least == 0:
+            return
+        if self._trials().around(kernel.cauchy, least):
+            self._solver = replace(kernel, cauchy_slip=0.0)
+            self._updates("init", first_free=1)
 
-        What moves by itself has pulled at the first solution, while nothing was known of it.
-        """
-        store = self.store
-        best = store.T_cw.clone(), store.disps.clone()
-        phase = replace(self.config.schedule["init"], iterations=_TRIAL_STEPS, learn=False)
-        rows = list(range(len(self.graph)))
-        cost = _BETTER * self._settled_cost(weigh=True)
-        better = False
-        for start in plane_starts(store.disps):
-            store.write(*start)
-            for number in range(1, len(store)):
-                self.optimiser.upright.turn(number, still=True)
-            self.optimiser.adjust(self.graph, rows, phase, self._solver, first_free=1)
-            found = self._settled_cost(weigh=True)
-            if found < cost:
-                cost, better = found, True
-                best = store.T_cw.clone(), store.disps.clone()
-        store.write(*best)
-        return better
-
-    def _settled_cost(self, weigh: bool) -> float:
-        """Energy of all edges at the present poses and depths, with uncertainty or without.
-
-        By a Cauchy kernel of the solver, what is far off hardly counts: the less of the energy, the
-        more of what was measured agrees.
-        """
-        before = self.store.T_cw.clone(), self.store.disps.clone()
-        row = self.config.schedule["init_blind"]
-        phase = replace(row, iterations=1, learn=False, weigh=weigh)
-        rows = list(range(len(self.graph)))
-        self.optimiser.adjust(self.graph, rows, phase, self._solver, first_free=1)
-        self.store.write(*before)
-        return self.optimiser.cost
+    def _trials(self) -> Trials:
+        return Trials(self.optimiser, self.graph, self.config.schedule, self._solver)
 
     def _first_solver(self) -> SolverConfig:
         """The solver of initialisation: with its Cauchy kernel where it is known what can move.

@@ -7,15 +7,30 @@ several starts are tried, and the one that explains the measurements best is kep
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from droidw.geometry.se3 import exp, mul
+from droidw.slam.doubt import explained_reach
 
-__all__ = ["mirrored", "plane_starts"]
+if TYPE_CHECKING:
+    from droidw.config.schema import PhaseConfig, SolverConfig
+    from droidw.graph.factors import FactorGraph
+    from droidw.slam.optimise import Optimiser
 
+__all__ = ["Trials", "mirrored", "plane_starts"]
+
+# Gauss-Newton steps of a start, and the share of the energy that it must beat.
+_STEPS = 15
+_BETTER = 0.98
+# Widths of the kernel by which a start narrows down to what it holds on to, times the last of
+# them, and steps with each.
+_NARROWING = 8.0, 4.0, 1.0
+_NARROWING_STEPS = 10
 # Step between keyframes in plane depths: a hint of a direction, not a guess of a length.
 _HINT = 0.02
 
@@ -58,3 +73,98 @@ def plane_starts(disps: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         T_cw[:, :3] = steps * way
         T_cw[:, 6] = 1.0
         yield T_cw, torch.ones_like(disps)
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Starts of the first keyframes, compared by what bundle adjustment makes of them.
+
+    Attributes:
+        optimiser: of a store that holds these keyframes and no others.
+        graph: its edges, measured.
+        schedule: phases by name. solver: of initialisation.
+    """
+
+    optimiser: Optimiser
+    graph: FactorGraph
+    schedule: Mapping[str, PhaseConfig]
+    solver: SolverConfig
+
+    def again(self) -> bool:
+        """Start over from planes, now that uncertainty has its say, and keep what fits best.
+
+        What moves by itself has pulled at the first solution, while nothing was known of it.
+
+        Returns:
+            Whether anything fits better than what the store held.
+        """
+        store = self.optimiser.store
+        best = store.T_cw.clone(), store.disps.clone()
+        cost = _BETTER * self.settled_cost(weigh=True)
+        better = False
+        for start in plane_starts(store.disps):
+            self._set_out(start)
+            found = self.settled_cost(weigh=True)
+            if found < cost:
+                cost, better = found, True
+                best = store.T_cw.clone(), store.disps.clone()
+        store.write(*best)
+        return better
+
+    def around(self, kernel: float, least: float) -> bool:
+        """Start over where nothing known can move, and keep what reaches farthest, if by far.
+
+        Something large that moves, before the camera or ahead of it on a road, can have as many
+        matches as the world around it, and no kernel tells which of both stands still. Each start
+        narrows down to what it holds on to, and what the store held as well.
+
+        Args:
+            kernel: last width of the Cauchy kernel, cells.
+            least: how many times farther than what the store held, see `explained_reach`.
+        Returns:
+            Whether anything does.
+        """
+        store = self.optimiser.store
+        best = store.T_cw.clone(), store.disps.clone()
+        farthest, better = least * self._reach(kernel), False
+        for start in plane_starts(store.disps):
+            self._set_out(start)
+            reach = self._reach(kernel)
+            if reach > farthest:
+                farthest, better = reach, True
+                best = store.T_cw.clone(), store.disps.clone()
+        store.write(*best)
+        return better
+
+    def settled_cost(self, weigh: bool) -> float:
+        """Energy of all edges at the present poses and depths, with uncertainty or without.
+
+        By a Cauchy kernel of the solver, what is far off hardly counts: the less of the energy, the
+        more of what was measured agrees.
+        """
+        store = self.optimiser.store
+        before = store.T_cw.clone(), store.disps.clone()
+        row = self.schedule["init_blind"]
+        self._adjust(replace(row, iterations=1, learn=False, weigh=weigh), self.solver)
+        store.write(*before)
+        return self.optimiser.cost
+
+    def _set_out(self, start: tuple[Tensor, Tensor]) -> None:
+        """Adjust from poses [N,7] and disparities [N,h,w], upright where that is known."""
+        store = self.optimiser.store
+        store.write(*start)
+        for number in range(1, len(store)):
+            self.optimiser.upright.turn(number, still=True)
+        self._adjust(replace(self.schedule["init"], iterations=_STEPS, learn=False), self.solver)
+
+    def _reach(self, kernel: float) -> float:
+        """How far what agrees reaches, once a narrower kernel has given up the rest."""
+        phase = replace(self.schedule["init"], iterations=_NARROWING_STEPS, learn=False)
+        for wider in _NARROWING:
+            self._adjust(phase, replace(self.solver, cauchy=wider * kernel, cauchy_slip=0.0))
+        store = self.optimiser.store
+        return explained_reach(store, self.graph, self.graph.select(), self.optimiser.gates(0))
+
+    def _adjust(self, phase: PhaseConfig, solver: SolverConfig) -> None:
+        rows = list(range(len(self.graph)))
+        self.optimiser.adjust(self.graph, rows, phase, solver, first_free=1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +14,7 @@ from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
 from droidw.graph.factors import FactorGraph
 from droidw.graph.store import KeyframeInfo, KeyframeStore
-from droidw.slam.doubt import explained_share
+from droidw.slam.doubt import explained_reach, explained_share
 from droidw.slam.frontend import Frontend
 
 H, W = 6, 8
@@ -102,3 +103,26 @@ def test_keyframes_are_nearer_where_something_is_hidden(
     else:
         store["movable"][1, :rows] = 0.5
     assert frontend._redundant() == dropped
+
+
+def test_what_agrees_reaches_as_far_as_its_cells_are_spread(measured):
+    """A quarter of all cells agree: one corner of the picture, or every other row and column."""
+    store, graph, gates = measured
+    assert explained_reach(store, graph, [0, 1], gates) == pytest.approx(1.0)
+    corner = torch.zeros(H, W, dtype=torch.bool)
+    corner[: H // 2, : W // 2] = True
+    spread = torch.zeros(H, W, dtype=torch.bool)
+    spread[::2, ::2] = True
+    target, reach = graph.target.clone(), []
+    for cells in (corner, spread):
+        elsewhere = torch.where(cells[..., None], 0.0, 1e3)
+        graph.record([0, 1], target + elsewhere, graph.confidence[[0, 1]])
+        reach.append(explained_reach(store, graph, [0, 1], gates))
+    # variances of runs of 3 and 4 cells against those of 6 and 8
+    assert reach[0] == pytest.approx(0.25 * math.sqrt((8 / 35) * (15 / 63)), rel=1e-3)
+    assert reach[1] == pytest.approx(0.25 * math.sqrt((32 / 35) * (60 / 63)), rel=1e-3)
+
+
+def test_nothing_reaches_anywhere_where_nothing_was_measured(measured):
+    store, graph, gates = measured
+    assert explained_reach(store, graph, [0, 1], 0 * gates) == 0.0
