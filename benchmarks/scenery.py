@@ -6,17 +6,17 @@ Cars are boxes that stand on the ground and drive; the other movers are cut out 
 in `movers.py`.
 
     python benchmarks/scenery.py DATA OUT
-    droidw run OUT/NAME_moving --preset cpu threads=1
+    droidw run OUT/NAME --preset cpu threads=1
 
-For each scene it writes OUT/NAME (static) and OUT/NAME_moving with masks.
+For each scene it writes OUT/NAME (static), and OUT/NAME_moving and others of SCENES with masks.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from math import cos, pi, sin
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import pi
 from pathlib import Path
 
 import cv2
@@ -24,255 +24,66 @@ import numpy as np
 import numpy.typing as npt
 from unseen import Mover
 from variants import Clip, Size
+from worlds import Path6, World, pose_at, shelves, square, street, track, village
 
 from droidw.testing import _textures as textures
-from droidw.testing._motion import Pose, quaternion, rotation
-from droidw.testing._shapes import TEXEL, Body, Hits, cast, face_size
+from droidw.testing._motion import Pose, quaternion
+from droidw.testing._shapes import TEXEL, Body, Hits, cast
 
-Floats = npt.NDArray[np.float64]
 Image = npt.NDArray[np.float32]
-Paint = Callable[[np.random.Generator, int, int], Image]
-Path6 = Callable[[float], tuple[float, float, float, float, float, float]]
-"""From 0 (first picture) to 1 (last): x, y (down), z (forward), yaw, pitch, roll."""
-
-
-def facade(rng: np.random.Generator, height: int, width: int) -> Image:
-    """Plaster with windows in rows, some of them lit, ledges and stains."""
-    image = np.empty((height, width, 3), np.float32)
-    image[:] = rng.uniform(90, 200) + rng.uniform(-30, 30, 3)
-    image += 30 * textures.noise(rng, height, width, 60, 5, 0.75)
-    storey, bay = int(rng.integers(38, 60)), int(rng.integers(30, 52))
-    for y in range(8, height - storey // 2, storey):
-        image[y : y + 2] *= 0.7
-        for x in range(6, width - bay // 2, bay):
-            h, w = int(storey * rng.uniform(0.45, 0.6)), int(bay * rng.uniform(0.4, 0.6))
-            pane = image[y + 8 : y + 8 + h, x : x + w]
-            pane[:] = rng.uniform(20, 110) + rng.uniform(-15, 15, 3)
-            pane += 40 * textures.noise(rng, *pane.shape[:2], 12, 3)
-            pane[:, pane.shape[1] // 2 : pane.shape[1] // 2 + 2] += 70
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8), np.float32)
-
-
-def asphalt(rng: np.random.Generator, height: int, width: int) -> Image:
-    """Grey and rough, with patches, cracks and a dashed line in the middle."""
-    image = np.empty((height, width, 3), np.float32)
-    image[:] = rng.uniform(85, 125)
-    image += 22 * textures.noise(rng, height, width, 90, 3)
-    image += 26 * textures.noise(rng, height, width, 7, 3, 0.9)
-    for _ in range(height * width // 30000):
-        y, x = int(rng.integers(height)), int(rng.integers(width))
-        image[y : y + int(rng.integers(8, 60)), x : x + int(rng.integers(8, 60))] -= 14
-    for y in range(0, height, 90):
-        image[y : y + 45, width // 2 - 2 : width // 2 + 3] = 210
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.8), np.float32)
-
-
-def grass(rng: np.random.Generator, height: int, width: int) -> Image:
-    """Green to brown at all scales."""
-    tone = textures.noise(rng, height, width, 260, 8, 0.72)
-    image = np.array([96, 112, 62], np.float32) + tone * (70, 62, 48)
-    image += 22 * textures.noise(rng, height, width, 40, 4, 0.7, 3)
-    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8), np.float32)
-
-
-def hedge(rng: np.random.Generator, height: int, width: int) -> Image:
-    """Leaves: dark and bright at small scales."""
-    tone = textures.noise(rng, height, width, 40, 5, 0.9)
-    image = np.array([62, 84, 44], np.float32) + tone * (84, 92, 56)
-    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8), np.float32)
-
-
-@dataclass
-class World:
-    """Boxes on the ground (y = 0, y down) below a sky, and what drives between them."""
-
-    rng: np.random.Generator
-    bodies: list[Body] = field(default_factory=list)
-    paths: list[Path6] = field(default_factory=list)
-    tiles: list[Image] = field(default_factory=list)
-
-    def box(
-        self, paint: Paint, size: Sequence[float], path: Path6 | Sequence[float], actor: int = 0
-    ) -> None:
-        """A box that stands at x, z with a yaw, or drives: `path` gives where its middle is."""
-        half = np.asarray(size, np.float64) / 2
-        body = Body("box", half, len(self.tiles), actor)
-        if not callable(path):
-            x, z, yaw = path
-            path = _still(x, -float(half[1]), z, yaw)
-        self.bodies.append(body)
-        self.paths.append(path)
-        self.tiles += textures.paint_box(paint, self.rng, [face_size(half, f) for f in range(6)])
-
-    def ground(self, paint: Paint, width: float, length: float, z: float) -> None:
-        """A slab whose upper side is the ground from -width/2 to width/2 around z."""
-        self.box(paint, (width, 0.1, length), _still(0.0, 0.05, z, 0.0))
-
-
-def _still(x: float, y: float, z: float, yaw: float) -> Path6:
-    return lambda t: (x, y, z, yaw, 0.0, 0.0)
-
-
-def _pose(path: Path6, t: float) -> Pose:
-    x, y, z, yaw, pitch, roll = path(t)
-    return Pose(rotation(yaw, pitch, roll), np.array([x, y, z]))
-
-
-def street(world: World) -> Path6:
-    """Along a street behind a car, at a height of a third of a storey, with a slight bend."""
-    world.ground(asphalt, 6.0, 18.0, 7.0)
-    for side in (-1, 1):
-        z = -1.5
-        while z < 15:
-            depth, high = world.rng.uniform(0.9, 1.8), world.rng.uniform(0.8, 2.0)
-            x = side * (1.25 + 0.4 + world.rng.uniform(0, 0.15))
-            world.box(facade, (0.8, high, depth), (x, z + depth / 2, 0.0))
-            z += depth + (0.0 if world.rng.random() < 0.7 else 0.3)
-        for z in np.arange(0.0, 13.0, 1.6):
-            parked = (0.3, 0.26, 0.7), (side * 1.0, z + world.rng.uniform(0, 0.5), 0.0)
-            world.box(textures.furniture, *parked)
-    world.box(facade, (6.0, 2.2, 0.5), (0.0, 16.0, 0.0))
-
-    def drive(t: float, ahead: float = 0.0) -> tuple[float, float, float, float, float, float]:
-        z = 8.0 * t + ahead
-        x = 0.25 * sin(0.5 * z)
-        return x, -0.3, z, 0.125 * cos(0.5 * z), 0.03 * sin(9 * t), 0.01 * sin(7 * t)
-
-    def before(t: float) -> tuple[float, float, float, float, float, float]:
-        x, _, z, yaw, *_ = drive(t, 1.35 + 0.25 * sin(5 * t))
-        return x + 0.05, -0.22, z, yaw, 0.0, 0.0
-
-    def oncoming(t: float) -> tuple[float, float, float, float, float, float]:
-        return -0.55, -0.15, 14.0 - 12.0 * t, 0.0, 0.0, 0.0
-
-    world.box(textures.fabric, (0.5, 0.42, 0.7), before, actor=1)
-    world.box(textures.furniture, (0.32, 0.3, 0.7), oncoming, actor=2)
-    return drive
-
-
-def square(world: World) -> Path6:
-    """Half around a fountain on a paved square with houses, hand-held."""
-    world.ground(textures.planks, 8.0, 8.0, 0.0)
-    for k in range(14):
-        angle = 2 * pi * k / 14
-        size = (1.3, world.rng.uniform(1.0, 2.2), 0.8)
-        world.box(facade, size, (3.2 * sin(angle), 3.2 * cos(angle), angle))
-    world.box(textures.wall, (0.5, 0.9, 0.5), (0.1, 0.2, 0.4))
-    for _ in range(9):
-        x, z = world.rng.uniform(-2.2, 2.2, 2)
-        if x * x + z * z < 2.6:
-            size = world.rng.uniform(0.15, 0.5, 3)
-            world.box(textures.furniture, size, (x, z, world.rng.uniform(0, 3)))
-
-    def walk(t: float) -> tuple[float, float, float, float, float, float]:
-        angle = 2.2 * t - 1.0
-        step = 2 * pi * 9 * t
-        x, z = 1.9 * sin(angle), -1.9 * cos(angle)
-        return (
-            x + 0.012 * sin(step / 2),
-            -0.42 + 0.012 * sin(step),
-            z,
-            -angle + 0.25 * sin(6 * t),
-            0.02 * sin(8 * t) + 0.01 * sin(step),
-            0.03 * sin(5 * t),
-        )
-
-    return walk
-
-
-def village(world: World) -> Path6:
-    """From above and aslant: houses and hedges on a meadow, the drone flies a bow."""
-    world.ground(grass, 14.0, 14.0, 0.0)
-    for _ in range(34):
-        x, z = world.rng.uniform(-4.5, 4.5, 2)
-        size = world.rng.uniform((0.3, 0.2, 0.3), (1.0, 0.7, 1.0))
-        paint = (facade, hedge, textures.furniture)[int(world.rng.integers(3))]
-        world.box(paint, size, (x, z, world.rng.uniform(0, pi)))
-
-    def fly(t: float) -> tuple[float, float, float, float, float, float]:
-        angle = 1.4 * t
-        return (
-            3.0 * sin(angle) - 1.5,
-            -2.4 - 0.5 * t,
-            3.5 * t - 4.2,
-            0.5 * sin(4 * t),
-            -0.75 + 0.1 * sin(5 * t),
-            0.12 * sin(3 * t),
-        )
-
-    return fly
-
-
-def shelves(world: World) -> Path6:
-    """Past shelves that are an arm's length away, in a corridor."""
-    world.ground(textures.planks, 6.0, 9.0, 0.0)
-    world.box(textures.wall, (6.0, 2.4, 0.1), (0.0, 1.3, 0.0))
-    for x in np.arange(-2.6, 2.6, 0.55):
-        for y in (-0.15, -0.7, -1.25, -1.8):
-            size = world.rng.uniform((0.3, 0.2, 0.15), (0.5, 0.5, 0.5))
-            z = 1.2 - size[2] / 2
-            world.box(textures.furniture, size, _still(x, y, z, world.rng.uniform(-0.1, 0.1)))
-
-    def pass_by(t: float) -> tuple[float, float, float, float, float, float]:
-        return (
-            2.4 * t - 1.2,
-            -1.0 + 0.12 * sin(6 * t),
-            0.08 * sin(5 * t),
-            0.2 * sin(7 * t),
-            0.06 * sin(9 * t),
-            0.05 * sin(4 * t),
-        )
-
-    return pass_by
-
-
-def track(world: World) -> Path6:
-    """Between hedges on a meadow, into a bend, with trees of two boxes."""
-    world.ground(grass, 16.0, 16.0, 3.0)
-
-    def middle(z: float) -> float:
-        return 0.12 * z * z
-
-    for z in np.arange(-1.5, 6.5, 0.55):
-        yaw = np.arctan(0.24 * z)
-        for side in (-1, 1):
-            x = middle(z) + side * (0.9 + world.rng.uniform(0, 0.3))
-            size = world.rng.uniform((0.25, 0.3, 0.5), (0.5, 0.7, 0.7))
-            world.box(hedge, size, (x, z, yaw))
-            if world.rng.random() < 0.35:
-                at = x + side * world.rng.uniform(0.5, 1.2), z
-                world.box(textures.planks, (0.12, 1.0, 0.12), (*at, 0.3))
-                crown = world.rng.uniform(0.5, 0.9, 3)
-                world.box(hedge, crown, _still(at[0], -1.2, at[1], world.rng.uniform(0, 3)))
-
-    def ride(t: float) -> tuple[float, float, float, float, float, float]:
-        z = 4.5 * t - 0.8
-        bump = 0.012 * sin(60 * t) + 0.008 * sin(97 * t)
-        return middle(z), -0.35 + bump, z, float(np.arctan(0.24 * z)), 0.5 * bump, 0.4 * bump
-
-    return ride
 
 
 @dataclass(frozen=True)
 class Made:
-    """One of SCENES: how it is built, its pictures, and what is pasted over them."""
+    """One of SCENES: how it is built, its pictures, and what is pasted over them, by clip.
+
+    The clip of no movers is that of the cars of the scene itself.
+    """
 
     build: Callable[[World], Path6]
     size: Size
     fps: float
     frames: int
     focal: float
-    movers: tuple[Mover, ...]
+    clips: Mapping[str, tuple[Mover, ...]]
 
 
 _GOAT, _CAMEL = "composite_kitchen", "composite_hospital"  # and their dancers
 _RUNNER, _CAR = "davis_parkour", "davis_car-roundabout"
 SCENES = {
-    "street": Made(street, (480, 270), 12.0, 140, 0.8, ()),
-    "square": Made(square, (320, 240), 15.0, 160, 0.75, (Mover(_GOAT),)),
-    "village": Made(village, (400, 300), 10.0, 120, 0.9, (Mover(_CAMEL, 0.8, 0.1, True),)),
-    "shelves": Made(shelves, (270, 360), 20.0, 150, 1.1, (Mover(_RUNNER, 1.6), Mover(_CAR, 0.8))),
-    "track": Made(track, (320, 180), 15.0, 140, 0.7, (Mover(_GOAT, 0.8, -0.1, True, 40),)),
+    "street": Made(
+        street,
+        (480, 270),
+        12.0,
+        140,
+        0.8,
+        {"moving": (), "car": (Mover(_CAR),), "goat": (Mover(_GOAT),)},
+    ),
+    "square": Made(
+        square,
+        (320, 240),
+        15.0,
+        160,
+        0.75,
+        {"moving": (Mover(_GOAT),), "camel": (Mover(_CAMEL, 1.3, 0.0, True, 20),)},
+    ),
+    "village": Made(
+        village, (400, 300), 10.0, 120, 0.9, {"moving": (Mover(_CAMEL, 0.8, 0.1, True),)}
+    ),
+    "shelves": Made(
+        shelves, (270, 360), 20.0, 150, 1.1, {"moving": (Mover(_RUNNER, 1.6), Mover(_CAR, 0.8))}
+    ),
+    "track": Made(
+        track,
+        (320, 180),
+        15.0,
+        140,
+        0.7,
+        {
+            "moving": (Mover(_GOAT, 0.8, -0.1, True, 40),),
+            "car": (Mover(_CAR, 0.8, 0.05, True),),
+        },
+    ),
 }
 
 
@@ -292,7 +103,7 @@ class Renderer:
 
     def pose(self, k: int) -> Pose:
         """Camera to world."""
-        return _pose(self.camera, k / (self.made.frames - 1))
+        return pose_at(self.camera, k / (self.made.frames - 1))
 
     def render(self, k: int, moving: bool) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
         """Picture number k [H,W,3], and what in it [H,W] moves."""
@@ -304,7 +115,7 @@ class Renderer:
         ]
         bodies = [self.world.bodies[b] for b in there]
         t = k / (self.made.frames - 1)
-        poses = [_pose(self.world.paths[b], t) for b in there]
+        poses = [pose_at(self.world.paths[b], t) for b in there]
         hits = cast(bodies, poses, self.pose(k), self.intrinsics, x, y)
         hits.body[~np.isfinite(hits.depth)] = -1
         colour = self._shade(bodies, hits, k, x, y).reshape(2 * height, 2 * width, 3)
@@ -341,21 +152,16 @@ class Renderer:
             colour[above] = sky.reshape(-1, 3)[: len(turn)]
         return colour
 
-    def clip(self, data: Path, moving: bool) -> Clip:
-        """All pictures, with masks where anything moves."""
-        made = self.made
-        rendered = [self.render(k, moving) for k in range(made.frames)]
-        poses = [self.pose(k) for k in range(made.frames)]
+    def clip(self, moving: bool = False) -> Clip:
+        """All pictures, with masks where cars drive."""
+        frames = range(self.made.frames)
+        rendered = [self.render(k, moving) for k in frames]
+        poses = map(self.pose, frames)
         rows = np.stack([np.concatenate([p.t, quaternion(p.R)]) for p in poses])
         fx, fy, cx, cy = map(float, self.intrinsics)
-        times = np.round(np.arange(made.frames) / made.fps, 6)
-        clip = Clip([p for p, _ in rendered], [], times, rows, (fx, fy, cx, cy))
-        if not moving:
-            return clip
-        layers = [mover.layer(data, made.size, made.frames) for mover in made.movers]
-        pasted = clip.under(layers)
-        masks = [a | b for (_, a), b in zip(rendered, pasted.masks, strict=True)]
-        return Clip(pasted.pictures, masks, times, rows, (fx, fy, cx, cy))
+        times = np.round(np.arange(self.made.frames) / self.made.fps, 6)
+        masks = [mask for _, mask in rendered] if moving else []
+        return Clip([picture for picture, _ in rendered], masks, times, rows, (fx, fy, cx, cy))
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -368,10 +174,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         raise SystemExit(f"{asked.out} is there already; name another folder")
     for seed, (name, made) in enumerate(SCENES.items()):
         renderer = Renderer(made, seed)
-        for moving in (False, True):
-            clip = renderer.clip(asked.data, moving)
-            clip.write(asked.out / (name + "_moving" * moving))
-        print(f"{name}: {len(clip.pictures)} pictures, {clip.moving:.0%} of them moves")
+        still = renderer.clip()
+        still.write(asked.out / name)
+        for of, movers in made.clips.items():
+            layers = [mover.layer(asked.data, made.size, made.frames) for mover in movers]
+            clip = still.under(layers) if movers else renderer.clip(moving=True)
+            clip.write(asked.out / f"{name}_{of}")
+            print(f"{name}_{of}: {len(clip.pictures)} pictures, {clip.moving:.0%} of them moves")
 
 
 if __name__ == "__main__":
