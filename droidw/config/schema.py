@@ -135,9 +135,8 @@ class FrontendConfig:
     starts: bool = opt(True, "at initialisation, try several starts and keep what fits best")
     surrounds: float = opt(
         1.1,
-        "with `starts`, where nothing known can move: how many times farther over the picture "
-        "what agrees with a start must reach than with what was found, to be taken for what "
-        "stands still (0: not asked)",
+        "with `starts`: how many times farther over the picture what agrees with a start must "
+        "reach than with what was found, to be taken for what stands still (0: not asked)",
         ge=0,
     )
     redundant: Literal["newest", "middle"] = opt(

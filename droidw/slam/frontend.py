@@ -122,7 +122,7 @@ class Frontend:
         if self._trials().again():
             self._updates("init", first_free=1)
         kernel, least = self.config.solver, self.options.surrounds
-        if self._solver.cauchy > 0 or kernel.cauchy == 0 or least == 0:
+        if kernel.cauchy == 0 or least == 0:
             return
         if self._trials().around(kernel.cauchy, least):
             self._solver = replace(kernel, cauchy_slip=0.0)

@@ -103,7 +103,7 @@ class Trials:
         cost = _BETTER * self.settled_cost(weigh=True)
         better = False
         for start in plane_starts(store.disps):
-            self._set_out(start)
+            self._set_out(start, self.solver)
             found = self.settled_cost(weigh=True)
             if found < cost:
                 cost, better = found, True
@@ -112,11 +112,12 @@ class Trials:
         return better
 
     def around(self, kernel: float, least: float) -> bool:
-        """Start over where nothing known can move, and keep what reaches farthest, if by far.
+        """Start over with a kernel that narrows, and keep what reaches farthest, if by far.
 
         Something large that moves, before the camera or ahead of it on a road, can have as many
-        matches as the world around it, and no kernel tells which of both stands still. Each start
-        narrows down to what it holds on to, and what the store held as well.
+        matches as the world around it, and no kernel tells which of both stands still. And by a
+        narrow kernel alone a path can break in two pieces of different scale, each of which agrees.
+        Each start narrows down to what it holds on to, and what the store held as well.
 
         Args:
             kernel: last width of the Cauchy kernel, cells.
@@ -128,7 +129,7 @@ class Trials:
         best = store.T_cw.clone(), store.disps.clone()
         farthest, better = least * self._reach(kernel), False
         for start in plane_starts(store.disps):
-            self._set_out(start)
+            self._set_out(start, replace(self.solver, cauchy=0.0))
             reach = self._reach(kernel)
             if reach > farthest:
                 farthest, better = reach, True
@@ -149,13 +150,13 @@ class Trials:
         store.write(*before)
         return self.optimiser.cost
 
-    def _set_out(self, start: tuple[Tensor, Tensor]) -> None:
+    def _set_out(self, start: tuple[Tensor, Tensor], solver: SolverConfig) -> None:
         """Adjust from poses [N,7] and disparities [N,h,w], upright where that is known."""
         store = self.optimiser.store
         store.write(*start)
         for number in range(1, len(store)):
             self.optimiser.upright.turn(number, still=True)
-        self._adjust(replace(self.schedule["init"], iterations=_STEPS, learn=False), self.solver)
+        self._adjust(replace(self.schedule["init"], iterations=_STEPS, learn=False), solver)
 
     def _reach(self, kernel: float) -> float:
         """How far what agrees reaches, once a narrower kernel has given up the rest."""
@@ -163,7 +164,7 @@ class Trials:
         for wider in _NARROWING:
             self._adjust(phase, replace(self.solver, cauchy=wider * kernel, cauchy_slip=0.0))
         store = self.optimiser.store
-        return explained_reach(store, self.graph, self.graph.select(), self.optimiser.gates(0))
+        return explained_reach(store, self.graph, self.graph.select(), self.optimiser.gates())
 
     def _adjust(self, phase: PhaseConfig, solver: SolverConfig) -> None:
         rows = list(range(len(self.graph)))

@@ -90,12 +90,14 @@ def test_the_street_itself_is_not_left(behind_a_van):
     ("cauchy", "known", "surrounds", "asked"),
     [
         (0.15, False, 1.1, True),
-        (0.15, True, 1.1, False),
+        (0.15, True, 1.1, True),
         (0.0, False, 1.1, False),
         (0.15, False, 0.0, False),
     ],
 )
-def test_it_is_asked_where_nothing_known_can_move(monkeypatch, cauchy, known, surrounds, asked):
+def test_it_is_asked_where_there_is_a_kernel_to_narrow(
+    monkeypatch, cauchy, known, surrounds, asked
+):
     config = DroidwConfig(frontend=FrontendConfig(surrounds=surrounds))
     config = replace(config, solver=replace(config.solver, cauchy=cauchy))
     frontend = Frontend.__new__(Frontend)
