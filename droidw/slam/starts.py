@@ -7,7 +7,7 @@ several starts are tried, and the one that explains the measurements best is kep
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -27,9 +27,11 @@ __all__ = ["Trials", "mirrored", "plane_starts"]
 # Gauss-Newton steps of a start, and the share of the energy that it must beat.
 _STEPS = 15
 _BETTER = 0.98
-# Widths of the kernel by which a start narrows down to what it holds on to, times the last of
-# them, and steps with each.
-_NARROWING = 8.0, 4.0, 1.0
+# How much a steady motion counts while a start sets out, as `backend.motion_prior`; widths of the
+# kernel by which it then narrows down to what it holds on to, times the last of them, and how much
+# a steady motion counts with each; and steps with each.
+_STEADY = 100.0
+_NARROWING = (8.0, 100.0), (4.0, 33.0), (1.0, 0.0)
 _NARROWING_STEPS = 10
 # Step between keyframes in plane depths: a hint of a direction, not a guess of a length.
 _HINT = 0.02
@@ -117,7 +119,8 @@ class Trials:
         Something large that moves, before the camera or ahead of it on a road, can have as many
         matches as the world around it, and no kernel tells which of both stands still. And by a
         narrow kernel alone a path can break in two pieces of different scale, each of which agrees.
-        Each start narrows down to what it holds on to, and what the store held as well.
+        Each start begins with a motion that is steady, and narrows down to what it holds on to;
+        what the store held does so at once, and as the others do.
 
         Args:
             kernel: last width of the Cauchy kernel, cells.
@@ -126,11 +129,13 @@ class Trials:
             Whether anything does.
         """
         store = self.optimiser.store
-        best = store.T_cw.clone(), store.disps.clone()
-        farthest, better = least * self._reach(kernel), False
-        for start in plane_starts(store.disps):
-            self._set_out(start, replace(self.solver, cauchy=0.0))
-            reach = self._reach(kernel)
+        found = best = store.T_cw.clone(), store.disps.clone()
+        farthest, better = least * self._reach(kernel, _NARROWING[-1:]), False
+        for number, start in enumerate((found, *plane_starts(store.disps))):
+            store.write(*start)
+            if number:
+                self._set_out(start, replace(self.solver, cauchy=0.0), _STEADY)
+            reach = self._reach(kernel, _NARROWING)
             if reach > farthest:
                 farthest, better = reach, True
                 best = store.T_cw.clone(), store.disps.clone()
@@ -150,22 +155,31 @@ class Trials:
         store.write(*before)
         return self.optimiser.cost
 
-    def _set_out(self, start: tuple[Tensor, Tensor], solver: SolverConfig) -> None:
+    def _set_out(
+        self, start: tuple[Tensor, Tensor], solver: SolverConfig, steady: float = 0.0
+    ) -> None:
         """Adjust from poses [N,7] and disparities [N,h,w], upright where that is known."""
         store = self.optimiser.store
         store.write(*start)
         for number in range(1, len(store)):
             self.optimiser.upright.turn(number, still=True)
-        self._adjust(replace(self.schedule["init"], iterations=_STEPS, learn=False), solver)
+        phase = replace(self.schedule["init"], iterations=_STEPS, learn=False)
+        self._adjust(phase, solver, steady)
 
-    def _reach(self, kernel: float) -> float:
-        """How far what agrees reaches, once a narrower kernel has given up the rest."""
+    def _reach(self, kernel: float, narrowing: Sequence[tuple[float, float]]) -> float:
+        """How far what agrees reaches, once narrower kernels have given up the rest.
+
+        Args:
+            narrowing: widths of the kernel in lengths of `kernel`, and how much a steady motion
+                counts with each.
+        """
         phase = replace(self.schedule["init"], iterations=_NARROWING_STEPS, learn=False)
-        for wider in _NARROWING:
-            self._adjust(phase, replace(self.solver, cauchy=wider * kernel, cauchy_slip=0.0))
+        for wider, steady in narrowing:
+            solver = replace(self.solver, cauchy=wider * kernel, cauchy_slip=0.0)
+            self._adjust(phase, solver, steady)
         store = self.optimiser.store
         return explained_reach(store, self.graph, self.graph.select(), self.optimiser.gates())
 
-    def _adjust(self, phase: PhaseConfig, solver: SolverConfig) -> None:
+    def _adjust(self, phase: PhaseConfig, solver: SolverConfig, steady: float = 0.0) -> None:
         rows = list(range(len(self.graph)))
-        self.optimiser.adjust(self.graph, rows, phase, solver, first_free=1)
+        self.optimiser.adjust(self.graph, rows, phase, solver, first_free=1, motion_prior=steady)

@@ -13,6 +13,7 @@ from droidw.geometry.projective import reproject
 from droidw.geometry.se3 import exp
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import neighbour_edges
+from droidw.slam import starts
 from droidw.slam.frontend import Frontend
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.starts import Trials
@@ -76,6 +77,24 @@ def test_what_was_found_stays_to_the_bit_if_nothing_reaches_as_far(behind_a_van)
     before = store.T_cw.clone(), store.disps.clone()
     assert not trials.around(KERNEL, 100.0)
     assert torch.equal(store.T_cw, before[0]) and torch.equal(store.disps, before[1])
+
+
+def test_starts_begin_steady_and_narrow_and_so_does_what_was_found(behind_a_van, monkeypatch):
+    trials, _ = behind_a_van(3.0)
+    store, calls = trials.optimiser.store, []
+    before = store.disps.clone()
+
+    def adjusted(self, phase, solver, steady=0.0):
+        calls.append((round(solver.cauchy / KERNEL), steady))
+        store.disps[:] += 1.0
+
+    reached = iter((0.7, 0.9, *[0.8] * 7))
+    monkeypatch.setattr(Trials, "_adjust", adjusted)
+    monkeypatch.setattr(starts, "explained_reach", lambda *_: next(reached))
+    assert trials.around(KERNEL, 1.1)
+    narrowing = [(8, 100.0), (4, 33.0), (1, 0.0)]
+    assert calls == [(1, 0.0), *narrowing, *([(0, 100.0), *narrowing] * 7)]
+    assert torch.equal(store.disps, before + 3.0)  # what was found, once it has narrowed as well
 
 
 def test_the_street_itself_is_not_left(behind_a_van):
