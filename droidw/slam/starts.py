@@ -139,6 +139,8 @@ class Trials:
             if reach > farthest:
                 farthest, better = reach, True
                 best = store.T_cw.clone(), store.disps.clone()
+            if number == 0:  # others have to reach farther than what was found does either way
+                farthest = max(farthest, least * reach)
         store.write(*best)
         return better
 

@@ -88,7 +88,7 @@ def test_starts_begin_steady_and_narrow_and_so_does_what_was_found(behind_a_van,
         calls.append((round(solver.cauchy / KERNEL), steady))
         store.disps[:] += 1.0
 
-    reached = iter((0.7, 0.9, *[0.8] * 7))
+    reached = iter((0.7, 0.9, *[0.95] * 7))
     monkeypatch.setattr(Trials, "_adjust", adjusted)
     monkeypatch.setattr(starts, "explained_reach", lambda *_: next(reached))
     assert trials.around(KERNEL, 1.1)
