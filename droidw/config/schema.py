@@ -136,7 +136,8 @@ class FrontendConfig:
     surrounds: float = opt(
         1.1,
         "with `starts`: how many times farther over the picture what agrees with a start must "
-        "reach than with what was found, to be taken for what stands still (0: not asked)",
+        "reach than with what was found, to be taken for what stands still; asked where lines do "
+        "not tell how the camera is turned (0: not asked)",
         ge=0,
     )
     redundant: Literal["newest", "middle"] = opt(

@@ -118,11 +118,15 @@ class Frontend:
             store.write(*found)
 
     def _try_others(self) -> None:
-        """Start over from planes, and go on from what fits best, or surrounds the rest."""
+        """Start over from planes, and go on from what fits best, or surrounds the rest.
+
+        Where lines tell how the camera is turned no path broke or went with what moves, and what
+        reaches farther over bare walls was no better.
+        """
         if self._trials().again():
             self._updates("init", first_free=1)
         kernel, least = self.config.solver, self.options.surrounds
-        if kernel.cauchy == 0 or least == 0:
+        if kernel.cauchy == 0 or least == 0 or self.optimiser.upright.holds:
             return
         if self._trials().around(kernel.cauchy, least):
             self._solver = replace(kernel, cauchy_slip=0.0)

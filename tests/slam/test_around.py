@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -106,16 +107,17 @@ def test_the_street_itself_is_not_left(behind_a_van):
 
 
 @pytest.mark.parametrize(
-    ("cauchy", "known", "surrounds", "asked"),
+    ("cauchy", "known", "surrounds", "lines", "asked"),
     [
-        (0.15, False, 1.1, True),
-        (0.15, True, 1.1, True),
-        (0.0, False, 1.1, False),
-        (0.15, False, 0.0, False),
+        (0.15, False, 1.1, False, True),
+        (0.15, True, 1.1, False, True),
+        (0.0, False, 1.1, False, False),
+        (0.15, False, 0.0, False, False),
+        (0.15, True, 1.1, True, False),
     ],
 )
 def test_it_is_asked_where_there_is_a_kernel_to_narrow(
-    monkeypatch, cauchy, known, surrounds, asked
+    monkeypatch, cauchy, known, surrounds, lines, asked
 ):
     config = DroidwConfig(frontend=FrontendConfig(surrounds=surrounds))
     config = replace(config, solver=replace(config.solver, cauchy=cauchy))
@@ -126,7 +128,7 @@ def test_it_is_asked_where_there_is_a_kernel_to_narrow(
     monkeypatch.setattr(Trials, "again", lambda self: False)
     monkeypatch.setattr(Trials, "around", lambda self, *a: calls.append(a) or True)
     monkeypatch.setattr(Frontend, "_updates", lambda self, phase, first_free: calls.append(phase))
-    frontend.optimiser = frontend.graph = None
+    frontend.optimiser, frontend.graph = SimpleNamespace(upright=SimpleNamespace(holds=lines)), None
     frontend._try_others()
     assert calls == ([(cauchy, surrounds), "init"] if asked else [])
     assert frontend._solver.cauchy == (cauchy if known or asked else 0.0)
