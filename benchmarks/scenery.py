@@ -13,22 +13,21 @@ For each scene it writes OUT/NAME (static), and OUT/NAME_moving and others of SC
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import pi
-from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from unseen import Mover
+from unseen import Mover, folders
 from variants import Clip, Size
 from worlds import Path6, World, pose_at, shelves, square, street, track, village
 
 from droidw.testing import _textures as textures
 from droidw.testing._motion import Pose, quaternion
-from droidw.testing._shapes import TEXEL, Body, Hits, cast
+from droidw.testing._shapes import Body, Hits, cast
+from droidw.testing.scenes import painted
 
 Image = npt.NDArray[np.float32]
 
@@ -110,12 +109,14 @@ class Renderer:
         width, height = self.made.size
         y, x = np.mgrid[: 2 * height, : 2 * width].astype(np.float32)
         x, y = (x.ravel() - 0.5) / 2, (y.ravel() - 0.5) / 2
+        world, t = self.world, k / (self.made.frames - 1)
         there = [
-            b for b in range(len(self.world.bodies)) if moving or not self.world.bodies[b].actor
+            (body, path)
+            for body, path in zip(world.bodies, world.paths, strict=True)
+            if moving or not body.actor
         ]
-        bodies = [self.world.bodies[b] for b in there]
-        t = k / (self.made.frames - 1)
-        poses = [pose_at(self.world.paths[b], t) for b in there]
+        bodies = [body for body, _ in there]
+        poses = [pose_at(path, t) for _, path in there]
         hits = cast(bodies, poses, self.pose(k), self.intrinsics, x, y)
         hits.body[~np.isfinite(hits.depth)] = -1
         colour = self._shade(bodies, hits, k, x, y).reshape(2 * height, 2 * width, 3)
@@ -126,20 +127,8 @@ class Renderer:
         return np.clip(np.rint(image + 1.5 * noise), 0, 255).astype(np.uint8), share >= 0.5
 
     def _shade(self, bodies: list[Body], hits: Hits, k: int, x: Image, y: Image) -> Image:
-        u, v = np.zeros_like(x), np.zeros_like(x)
-        for number, body in enumerate(bodies):
-            chosen = np.flatnonzero(hits.body == number)
-            if len(chosen) == 0:
-                continue
-            face = hits.face[chosen].astype(np.intp)
-            across, down = body.texel(hits.point[:, chosen], face)
-            origin = self.atlas.origins[body.first_tile + face]
-            u[chosen], v[chosen] = across + origin[:, 0], down + origin[:, 1]
+        colour = painted(self.atlas, bodies, hits, self.intrinsics[0])
         above = hits.body < 0
-        depth = np.where(above, 1.0, hits.depth)
-        level = np.log2(depth / (2 * self.intrinsics[0] * TEXEL))
-        level -= 0.5 * np.log2(np.maximum(hits.slant, 0.05))
-        colour = self.atlas.sample(u, v, level.astype(np.float32))
         fx, fy, cx, cy = self.intrinsics
         rays = self.pose(k).R @ np.stack([(x - cx) / fx, (y - cy) / fy, np.ones_like(x)])[:, above]
         turn = np.arctan2(rays[0], rays[2]) / (2 * pi) + 0.5
@@ -166,20 +155,15 @@ class Renderer:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Write the clips."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path, help="folder of clips with masks")
-    parser.add_argument("out", type=Path, help="folder to write, not there yet")
-    asked = parser.parse_args(argv)
-    if asked.out.exists():
-        raise SystemExit(f"{asked.out} is there already; name another folder")
+    data, out = folders(__doc__, argv)
     for seed, (name, made) in enumerate(SCENES.items()):
         renderer = Renderer(made, seed)
         still = renderer.clip()
-        still.write(asked.out / name)
+        still.write(out / name)
         for of, movers in made.clips.items():
-            layers = [mover.layer(asked.data, made.size, made.frames) for mover in movers]
+            layers = [mover.layer(data, made.size, made.frames) for mover in movers]
             clip = still.under(layers) if movers else renderer.clip(moving=True)
-            clip.write(asked.out / f"{name}_{of}")
+            clip.write(out / f"{name}_{of}")
             print(f"{name}_{of}: {len(clip.pictures)} pictures, {clip.moving:.0%} of them moves")
 
 

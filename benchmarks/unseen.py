@@ -117,17 +117,23 @@ def make(data: Path, made: Made) -> Clip:
     return clip.under([m.layer(data, made.size, len(clip.pictures)) for m in made.movers])
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Write the clips."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+def folders(doc: str, argv: Sequence[str] | None) -> tuple[Path, Path]:
+    """DATA and OUT as a script with this docstring was asked for them; OUT is not there yet."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder of the clips that these are made of")
     parser.add_argument("out", type=Path, help="folder to write, not there yet")
     asked = parser.parse_args(argv)
     if asked.out.exists():
         raise SystemExit(f"{asked.out} is there already; name another folder")
+    return asked.data, asked.out
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Write the clips."""
+    data, out = folders(__doc__, argv)
     for name, made in CLIPS.items():
-        clip = make(asked.data, made)
-        clip.write(asked.out / name)
+        clip = make(data, made)
+        clip.write(out / name)
         print(f"{name}: {len(clip.pictures)} pictures, {clip.moving:.0%} of them moves")
 
 

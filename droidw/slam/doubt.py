@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.linalg import vector_norm
 
-from droidw.geometry.projective import reproject
+from droidw.geometry.projective import pixel_grid, reproject
 from droidw.solve.weights import agreeing_share, agreeing_weight
 
 if TYPE_CHECKING:
@@ -81,12 +81,7 @@ def explained_reach(
 def _scatter(weight: Tensor) -> float:
     """Area of the ellipse that weights [h,w] scatter in, up to a factor, in cells."""
     height, width = weight.shape
-    y, x = torch.meshgrid(
-        torch.arange(height, dtype=weight.dtype, device=weight.device),
-        torch.arange(width, dtype=weight.dtype, device=weight.device),
-        indexing="ij",
-    )
-    place = torch.stack([x, y]).flatten(1)
+    place = pixel_grid(height, width, weight.dtype, weight.device).flatten(0, 1).T
     part = weight.flatten() / weight.sum().clamp_min(1e-6)
     off = place - (place * part).sum(1, keepdim=True)
     return float(torch.linalg.det((off * part) @ off.T).clamp_min(0).sqrt())

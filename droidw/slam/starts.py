@@ -132,8 +132,9 @@ class Trials:
         found = best = store.T_cw.clone(), store.disps.clone()
         farthest, better = least * self._reach(kernel, _NARROWING[-1:]), False
         for number, start in enumerate((found, *plane_starts(store.disps))):
-            store.write(*start)
-            if number:
+            if number == 0:
+                store.write(*start)
+            else:
                 self._set_out(start, replace(self.solver, cauchy=0.0), _STEADY)
             reach = self._reach(kernel, _NARROWING)
             if reach > farthest:

@@ -21,7 +21,7 @@ from droidw.slam.frame import Trajectory
 from droidw.testing import _textures as textures
 from droidw.testing._motion import CAMERA_PATHS, Pose, actor_path, camera_path, quaternion
 from droidw.testing._room import FLOOR, furnish
-from droidw.testing._shapes import TEXEL, Hits, cast, face_size
+from droidw.testing._shapes import TEXEL, Body, Hits, cast, face_size
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Camera
@@ -344,17 +344,29 @@ class Scene:
 
     def _shade(self, hits: Hits) -> npt.NDArray[np.float32]:
         """Colours [N,3] of hits that came from two rays a pixel in each direction."""
-        atlas = self._atlas
-        x, y = np.zeros(len(hits.depth), np.float32), np.zeros(len(hits.depth), np.float32)
-        for number, body in enumerate(self._bodies):
-            chosen = np.flatnonzero(hits.body == number)
-            if len(chosen) == 0:
-                continue
-            face = hits.face[chosen].astype(np.intp)
-            u, v = body.texel(hits.point[:, chosen], face)
-            origin = atlas.origins[body.first_tile + face]
-            x[chosen], y[chosen] = u + origin[:, 0], v + origin[:, 1]
-        footprint = hits.depth / (2 * self.intrinsics[0] * TEXEL)
-        # Between the short and the long side of the slanted footprint.
-        level = np.log2(np.maximum(footprint, 1e-3)) - 0.5 * np.log2(np.maximum(hits.slant, 0.05))
-        return atlas.sample(x, y, level.astype(np.float32))
+        return painted(self._atlas, self._bodies, hits, self.intrinsics[0])
+
+
+def painted(
+    atlas: textures.Atlas, bodies: list[Body], hits: Hits, focal: np.float64
+) -> npt.NDArray[np.float32]:
+    """Colours [N,3] of hits of bodies whose faces are in the atlas, two rays a pixel each way.
+
+    Where nothing was hit (`body` is -1) they mean nothing.
+
+    Args:
+        focal: focal length in pixels.
+    """
+    x, y = np.zeros(len(hits.depth), np.float32), np.zeros(len(hits.depth), np.float32)
+    for number, body in enumerate(bodies):
+        chosen = np.flatnonzero(hits.body == number)
+        if len(chosen) == 0:
+            continue
+        face = hits.face[chosen].astype(np.intp)
+        u, v = body.texel(hits.point[:, chosen], face)
+        origin = atlas.origins[body.first_tile + face]
+        x[chosen], y[chosen] = u + origin[:, 0], v + origin[:, 1]
+    footprint = hits.depth / (2 * focal * TEXEL)
+    # Between the short and the long side of the slanted footprint.
+    level = np.log2(np.maximum(footprint, 1e-3)) - 0.5 * np.log2(np.maximum(hits.slant, 0.05))
+    return atlas.sample(x, y, level.astype(np.float32))
