@@ -72,6 +72,13 @@ class WeightingConfig:
         True, "after `backend.learn` half closed where values part best in two, if later"
     )
     floor: float = opt(0.1, "smallest denominator of the rational gate", gt=0)
+    closed_below: float = opt(
+        0.5,
+        "after `backend.learn` a cell that would keep less of its weight keeps none: what moves "
+        "together pulls together, however little each cell of it weighs (0: as the gate says)",
+        ge=0,
+        le=1,
+    )
     open_share: float = opt(
         0.5,
         "share of each picture, of what is least uncertain, that keeps its whole weight: most of "

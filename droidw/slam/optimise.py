@@ -136,8 +136,7 @@ class Optimiser:
     def begin(self) -> None:
         """Let uncertainty start from what features say of the keyframes so far, if it wants to."""
         if self.begins:
-            frames = range(len(self.store))
-            view = self.view(frames=frames)
+            view = self.view(frames=range(len(self.store)))
             with self.clock("uncertainty"):
                 self.parts.uncertainty.begin(view, self.store["movable"])  # type: ignore[attr-defined]
             self.begun = True
@@ -339,7 +338,8 @@ class Optimiser:
     def _gate(self, u: Tensor) -> Tensor:
         w = self.weighting
         u = opened(u / self._later, w.open_share, kind=w.gate, slope=w.slope, shift=w.shift)
-        return gate(u, kind=w.gate, slope=w.slope, shift=w.shift, floor=w.floor)
+        below = w.closed_below if self.anew else 0.0
+        return gate(u, w.gate, w.slope, w.shift, w.floor, below)
 
     def _part(self) -> None:
         """Let the gate close where what was learned parts in two, if that is later."""

@@ -46,6 +46,7 @@ def gate(
     slope: float = 45.0,
     shift: float = 35.0,
     floor: float = 0.1,
+    closed_below: float = 0.0,
 ) -> Tensor:
     """Share in [0,1] of its weight that a cell of uncertainty `u` keeps; 1 where `u` is 0.
 
@@ -57,6 +58,7 @@ def gate(
             u = (1 + shift) / slope = 0.8 with the defaults); "inverse" is `1 / u` as in the
             paper; both clamped to [0,1]. "none" is 1 everywhere.
         slope, shift, floor: of the rational gate; floor > 0.
+        closed_below: a share that would be less is 0. Neither form comes to 0 by itself.
     Returns:
         The same shape, dtype and device.
     Raises:
@@ -73,7 +75,8 @@ def gate(
         weight = u.clamp_min(1.0).reciprocal()
     else:
         raise ValueError(f"no gate is called {kind!r}; valid: rational, inverse, none")
-    return torch.where(torch.isfinite(u), weight, torch.zeros_like(weight))
+    keeps = torch.isfinite(u) & (weight >= closed_below)
+    return torch.where(keeps, weight, torch.zeros_like(weight))
 
 
 def half_open(kind: GateKind = "rational", slope: float = 45.0, shift: float = 35.0) -> float:

@@ -21,7 +21,7 @@ PAPER = {
     "backend.threshold": 25.0, "backend.radius": 1, "backend.nms": 5, "backend.nms_shape": "square",
     "backend.normalize": False, "backend.factors_per_keyframe": 6,
     "filler.updates": 12, "filler.keyframes": 1, "filler.batch": 16,
-    "weighting.similarity": "raw", "weighting.parted": False,
+    "weighting.similarity": "raw", "weighting.parted": False, "weighting.closed_below": 0.0,
     "weighting.gate": "rational", "weighting.slope": 45.0, "weighting.shift": 35.0,
     "weighting.floor": 0.1, "weighting.bidirectional": False,
     "weighting.confidence_scale": 0.001, "weighting.damping_scale": 0.2,

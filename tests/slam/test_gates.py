@@ -70,6 +70,21 @@ def test_half_of_a_picture_keeps_its_whole_weight_wherever_gates_are_asked():
     assert int((optimiser.gates(learned=False)[1] == 1.0).sum()) == 48
 
 
+def test_what_moves_has_no_weight_at_all_once_learned_anew():
+    optimiser, _ = two_keyframes()
+    assert optimiser.gates()[1].unique().tolist() == pytest.approx([1 / 55])
+    optimiser.anew = True
+    asked = (
+        optimiser.gates()[1],
+        optimiser.learned_gates([1]),
+        optimiser.view().gate(optimiser.store["uncertainty"][1]),
+    )
+    assert [gates.unique().tolist() for gates in asked] == [[0.0]] * 3
+    assert int((optimiser.gates()[0] == 1.0).sum()) == 47  # and what stands still keeps all of it
+    optimiser.weighting = WeightingConfig(open_share=0.0, closed_below=0.0)
+    assert optimiser.gates()[1].unique().tolist() == pytest.approx([1 / 55])
+
+
 class Moving:
     """Features that say what can move, and a model that begins with it."""
 

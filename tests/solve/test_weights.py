@@ -162,6 +162,16 @@ def test_what_is_alike_does_not_part(u):
 
 
 @pytest.mark.parametrize("kind", ["rational", "inverse"])
+def test_what_would_keep_less_keeps_nothing(kind):
+    u = torch.linspace(0.0, 5.0, 101)
+    as_it_says = gate(u, kind)
+    shut = gate(u, kind, closed_below=0.5)
+    assert (as_it_says > 0).all()
+    assert torch.equal(shut, torch.where(as_it_says < 0.5, 0.0, as_it_says))
+    assert gate(torch.tensor([2.0]), "inverse", closed_below=0.5).tolist() == [0.5]  # and no less
+
+
+@pytest.mark.parametrize("kind", ["rational", "inverse"])
 def test_half_of_the_gate(kind):
     assert gate(torch.tensor(half_open(kind)), kind).item() == pytest.approx(0.5, abs=1e-5)
     assert half_open("none") == math.inf
