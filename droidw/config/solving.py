@@ -74,8 +74,8 @@ class WeightingConfig:
     floor: float = opt(0.1, "smallest denominator of the rational gate", gt=0)
     closed_below: float = opt(
         0.5,
-        "after `backend.learn` a cell that would keep less of its weight keeps none: what moves "
-        "together pulls together, however little each cell of it weighs (0: as the gate says)",
+        "after `backend.learn` a cell that would keep less of its weight than this keeps none: "
+        "what moves together pulls together, however little each cell weighs (0: as the gate says)",
         ge=0,
         le=1,
     )
