@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from droidw.geometry.spread import closed
+from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,8 +28,7 @@ __all__ = ["Hidden", "rejection", "second_time", "to_hide"]
 
 _Mask = npt.NDArray[np.bool_]
 
-# Share of its weight below which a pixel is hidden, and share of pixels that is worth the time.
-_CLOSED = 0.5
+# Share of pixels that is worth the time.
 _FEW = 0.02
 # How much less than before may agree the second time, with other matches and other gates.
 _SLACK = 0.05
@@ -80,7 +80,7 @@ def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden | None
     gates = system.optimiser.learned_gates(range(len(store))).float().cpu().numpy()
     hidden = Hidden(
         [info.index for info in store.infos],
-        [closed(gate, grid.stride, grid.offset, size, _CLOSED) for gate in gates],
+        [closed(gate, grid.stride, grid.offset, size, CLOSED) for gate in gates],
     )
     return hidden if hidden.share >= _FEW else None
 

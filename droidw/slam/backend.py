@@ -16,6 +16,7 @@ from droidw.graph.proximity import backend_edges, frontend_edges
 from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 from droidw.slam.motion_filter import spans
+from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -147,7 +148,7 @@ class Backend:
 
     def _hidden(self) -> float:
         """Share of all cells that are closed, by uncertainty or a mask."""
-        return float((self.optimiser.gates() < 0.5).float().mean())
+        return float((self.optimiser.gates() < CLOSED).float().mean())
 
     def _prior(self, number: int) -> float:
         """How much steady motion counts in one pass; measurements have the last word."""

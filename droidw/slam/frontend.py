@@ -17,6 +17,7 @@ from droidw.slam.doubt import explained_share
 from droidw.slam.locate import carry_depth, locate
 from droidw.slam.motion_filter import spans
 from droidw.slam.starts import Trials, mirrored
+from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig, PhaseConfig, SolverConfig
@@ -145,7 +146,7 @@ class Frontend:
         solver = self.config.solver
         if solver.cauchy == 0:
             return solver
-        closed = self.optimiser.gates(learned=True) < 0.5
+        closed = self.optimiser.gates(learned=True) < CLOSED
         known = float(closed.float().mean()) > _KNOWN_MOVERS
         return replace(solver, cauchy_slip=0.0) if known else replace(solver, cauchy=0.0)
 

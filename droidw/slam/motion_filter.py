@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from droidw.interfaces.correspondence import Motion
+from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -24,14 +25,12 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-__all__ = ["MASKED", "Encoded", "MotionFilter", "Verdict", "look_ahead", "spans"]
+__all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "spans"]
 
 # Most of a picture is taken to stand still, whatever could move; and of pictures in which nothing
 # does, up to a tenth is taken for what can. In between it counts little by little: no one cell
 # decides.
 _LEAST_HIDDEN, _PLAINLY_HIDDEN, _MOST_HIDDEN = 0.1, 0.3, 0.5
-# Cells of which masks leave less than this are hidden.
-MASKED = 0.5
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,7 @@ def spans(
     """
     if options.movable_nearer == 0:
         return np.ones(len(movable))
-    gone = unmasked < MASKED
+    gone = unmasked < CLOSED
     if options.movable_above > 0:
         gone = gone | (movable > options.movable_above)
     return nearness(gone, options)

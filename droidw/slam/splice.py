@@ -11,6 +11,7 @@ from droidw.geometry.se3 import inv, mul
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import neighbour_edges
 from droidw.slam.doubt import explained_weight
+from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -118,6 +119,6 @@ def spliced(path: Path, other: Path, taken: list[bool], gates: Tensor) -> Path:
 def _scale(disps: Tensor, to: Tensor, gate: Tensor) -> float:
     """Median ratio of two inverse depths [h,w], where the gate is open if it is anywhere; or 1."""
     known = torch.isfinite(disps) & torch.isfinite(to) & (disps > 0) & (to > 0)
-    seen = known & (gate > 0.5)
+    seen = known & (gate >= CLOSED)
     seen = seen if bool(seen.any()) else known
     return float((disps[seen] / to[seen]).median()) if bool(seen.any()) else 1.0

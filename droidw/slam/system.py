@@ -26,11 +26,12 @@ from droidw.slam.filler import Filler
 from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
-from droidw.slam.motion_filter import MASKED, Encoded, MotionFilter, Verdict, look_ahead
+from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict, look_ahead
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.records import Outcome, keyframe_records
 from droidw.slam.streams import Ahead, nbytes
 from droidw.slam.timing import Stopwatch
+from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig
@@ -187,7 +188,7 @@ class SlamSystem:
         aside = self._aside and above > 0
         movable = self._maps.movable(frame) if self._renews or aside else None
         cells = movable > above if aside and movable is not None else None
-        masked = None if frame.mask is None else self._maps.unmasked(frame) < MASKED
+        masked = None if frame.mask is None else self._maps.unmasked(frame) < CLOSED
         self._filter.set_aside(current, cells, masked)
         return current if movable is None else replace(current, movable=movable)
 

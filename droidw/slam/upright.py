@@ -21,6 +21,7 @@ from droidw.solve.manhattan import (
     rotation_term,
 )
 from droidw.solve.planes import held_to_planes
+from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -245,7 +246,7 @@ class Upright:
         middle = 0.5 * (segments[:, :2] + segments[:, 2:])
         cell = np.rint((middle - grid.offset) / grid.stride).astype(np.int64)
         x, y = cell[:, 0].clip(0, grid.width - 1), cell[:, 1].clip(0, grid.height - 1)
-        return np.asarray(gate[y, x] >= 0.5)
+        return np.asarray(gate[y, x] >= CLOSED)
 
     def _keep(self, number: int, axes: Axes | None) -> None:
         if axes is None or axes.share < _KNOWN:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = [
+    "CLOSED",
     "GateKind",
     "agreeing_share",
     "agreeing_weight",
@@ -32,6 +33,9 @@ __all__ = [
 ]
 
 GateKind = Literal["rational", "inverse", "none"]
+
+CLOSED = 0.5
+"""What keeps less than this share of its weight is called closed, by a gate or by a mask."""
 
 _BINS = 256
 # A part of two has at least so large a share; two say far more than one from so much less error on.

@@ -14,6 +14,7 @@ import numpy as np
 
 from droidw.geometry.projective import pixel_grid
 from droidw.interfaces.correspondence import Motion, Purpose
+from droidw.solve.weights import CLOSED
 from droidw_plugins.correspondence._flow_information import (
     agreement,
     information,
@@ -68,8 +69,6 @@ _GRID_FIELDS = 20_000
 _SEEDED = 1.5
 _NEAR_SCALE = 2
 _CLEARLY = 1.05
-# Gate below which points are left out, where nothing else is.
-_CLOSED = 0.5
 # Checked pairs kept for the next session that asks for them, and what was found between whole
 # pictures: some forty kilobytes each.
 _PAIRS = 4_000
@@ -155,7 +154,7 @@ class FlowCorrespondence:
         """
         if not self.options.seeds:
             return np.zeros((0, 4), np.float32)
-        below = self.options.bridge or _CLOSED
+        below = self.options.bridge or CLOSED
         seeds = self._seeds.between(a, b, gate_a < below, gate_b < below)
         return np.concatenate([seeds.here, seeds.there], axis=1)[seeds.held]
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from droidw.slam.frame import KeyframeRecord
+from droidw.solve.weights import CLOSED
 
 __all__ = ["KeyframePictures", "choose", "colour_ramp", "data_uri", "keyframe_pictures"]
 
@@ -103,7 +104,7 @@ def keyframe_pictures(
                 record=record,
                 overlay=data_uri(overlay, ".jpg"),
                 depth=data_uri(shaded, ".jpg"),
-                moving=float(np.mean(record.weight < 0.5)),
+                moving=float(np.mean(record.weight < CLOSED)),
                 depth_share=float(np.mean(record.depth_valid)),
                 width=size[0],
                 height=size[1],
