@@ -12,6 +12,7 @@ from droidw.geometry.projective import pixel_grid
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw_plugins.correspondence import flow
 from droidw_plugins.correspondence._flow_information import (
+    framed,
     information,
     likeness,
     structure,
@@ -160,6 +161,29 @@ def test_a_match_may_slip_along_an_edge_but_not_off_it():
     assert dict(zip(errors, second, strict=True)) == pytest.approx(
         {"none": 1, "slip": 0, "off": 0, "across": half, "far": 0}, abs=1e-5
     )
+
+
+def test_matches_beside_the_border_of_either_picture_count_less():
+    frame = some_frame(20)
+    moved = np.zeros_like(frame.centres)
+    moved[3, 4] = -frame.centres[3, 4] + 4.0  # to the corner
+    moved[4, 4] = [WIDTH, 0]  # out of the picture
+    share = framed(frame, moved, 5.0)
+    less = np.ones_like(share, dtype=bool)
+    less[1:-1, 1:-1] = False
+    less[3, 4] = less[4, 4] = True
+    np.testing.assert_array_equal(share, np.where(less, np.float32(0.25), np.float32(1)))
+    assert share.dtype == np.float32
+    assert (framed(frame, np.zeros_like(moved), 0.0) == 1).all()
+
+
+@pytest.mark.parametrize(("border", "share"), [(5.0, 0.25), (0.0, 1.0)])
+def test_a_border_makes_no_match_worth_nothing(border, share, measured):
+    picture = stripes(20) + stripes(110)
+    _, counts = measured(picture, picture, border=border)
+    _, whole = measured(picture, picture, border=0.0)
+    torch.testing.assert_close(counts[0], share * whole[0])
+    torch.testing.assert_close(counts[5, 5], whole[5, 5])
 
 
 def strong_direction(confidence):

@@ -17,6 +17,7 @@ from droidw.interfaces.correspondence import Motion, Purpose
 from droidw.solve.weights import CLOSED
 from droidw_plugins.correspondence._flow_information import (
     agreement,
+    framed,
     information,
     likeness,
     sample,
@@ -216,7 +217,7 @@ class FlowCorrespondence:
         """Edge a -> b without the way back, exact at full size."""
         found = self._moved(a, b, self._search)
         moved = polished(a.grey, b.grey, a.centres, found, self.options.fill_window)
-        agrees = agreement(a, b, moved)
+        agrees = agreement(a, b, moved) * framed(a, moved, self.options.border)
         confidence = information(a, agrees, agrees, self.options)
         target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, None)
@@ -377,8 +378,9 @@ class FlowCorrespondence:
     def _checked(self, a: FlowFrame, found: Found) -> Edge:
         """Edge from `a`, by the structure of that frame."""
         across, along = trust(found.apart, a.normal, self.options)
-        if found.alike is not None:
-            across, along = across * found.alike, along * found.alike
+        share = framed(a, found.moved, self.options.border)
+        share = share if found.alike is None else share * found.alike
+        across, along = across * share, along * share
         normal = None
         if found.flow is not None:
             normal = turned(a, found.flow, self.options.turn_reach)

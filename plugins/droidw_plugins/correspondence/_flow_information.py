@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "agreement",
+    "framed",
     "information",
     "likeness",
     "powers",
@@ -26,6 +27,9 @@ __all__ = [
     "turned",
 ]
 
+# Share of its confidence that a match beside the border keeps. It is off by what it shares with all
+# others there, and still says more than nothing: before a bare wall there is little else.
+_FRAMED = 0.25
 # Squared image derivative below which a window counts as flat, (grey levels / pixel)^2.
 _FLAT = 0.1
 # Pixels at the border of a picture whose derivatives are not its own: of what lies beyond, Scharr
@@ -176,6 +180,26 @@ def turned(frame: FlowFrame, flow: Array, reach: int) -> Array:
     normal = np.stack([there[..., 1], -there[..., 0]], -1) / length[..., None]
     result: Array = np.where(alike[..., None], normal, frame.normal)
     return result
+
+
+def framed(a: FlowFrame, moved: Array, border: float) -> Array:
+    """What matches keep of their confidence by how near the border of either picture they are.
+
+    Patches and refinement have neighbours on one side only there, and windows end with the picture
+    or repeat its last row, which stays where it is while the picture moves.
+
+    Args:
+        moved: [h,w,2] displacement of the cells, pixels.
+        border: pixels from it.
+    Returns:
+        [h,w], 1 or a quarter; a match that leaves the picture has a quarter, too.
+    """
+    height, width = a.grey.shape
+    last = np.array([width - 1, height - 1], np.float32)
+    ends = (a.centres, a.centres + moved)
+    inside = np.min([np.minimum(end, last - end).min(axis=-1) for end in ends], axis=0)
+    share: Array = np.where(inside < border, np.float32(_FRAMED), np.float32(1.0))
+    return share
 
 
 def agreement(a: FlowFrame, b: FlowFrame, moved: Array) -> Array:

@@ -113,6 +113,15 @@ class FlowOptions:
             "ge": 0,
         },
     )
+    border: float = field(
+        default=5.0,
+        metadata={
+            "help": "pixels from the border of either picture below which a match counts a "
+            "quarter: what lies beyond is not known, and matches there fall short (0: all in full)",
+            "ge": 0.0,
+            "le": 32.0,
+        },
+    )
     restart: float = field(
         default=2.0,
         metadata={
