@@ -22,8 +22,9 @@ FLOW = (
     "backend.backwards_below=0",
     # nor do its depths, let go
     "global_solver.depth_damping=1",
-    # softened, its pictures hold a path even less
+    # softened, or with their border at a quarter, its pictures hold a path even less
     "correspondence.options.blur=0",
+    "correspondence.options.border=0",
 )
 DROID = ("--preset", "droid-slam", "correspondence.options={precision: float32, store: float}",
          "uncertainty=affine-softplus", "features=fit3d", "frontend.predict=velocity")  # fmt: skip
