@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import argparse
 import csv
-import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from statistics import fmean
+from statistics import geometric_mean
 
 FULL, NONE = "full", "no-uncertainty"
 BySeed = Mapping[int, float]
@@ -41,8 +40,8 @@ def alone(name: str, names: Iterable[str]) -> str | None:
 
 def mean(figures: Iterable[float]) -> float:
     """Geometric mean; nan of nothing."""
-    logarithms = [math.log(figure) for figure in figures]
-    return math.exp(fmean(logarithms)) if logarithms else math.nan
+    known = list(figures)
+    return geometric_mean(known) if known else float("nan")
 
 
 def times(above: BySeed, below: BySeed) -> float:

@@ -363,11 +363,11 @@ class FlowCorrespondence:
     ) -> Found:
         moved = sample(ab, a.centres)
         apart = moved + sample(ba, a.centres + moved, outside=1e4)
-        alike = None
+        share = framed(a, moved, self.options.border)
         if self.options.likeness > 0:
             pixels = self._pixels(*a.grey.shape)
-            alike = likeness(a, b, ab, pixels, self.options.likeness)
-        return Found(moved, apart, alike, ab if self.options.turn_reach else None, started)
+            share = share * likeness(a, b, ab, pixels, self.options.likeness)
+        return Found(moved, apart, share, ab if self.options.turn_reach else None, started)
 
     def _checked_both(
         self, frames: tuple[FlowFrame, FlowFrame], found: tuple[Found, Found]
@@ -378,9 +378,7 @@ class FlowCorrespondence:
     def _checked(self, a: FlowFrame, found: Found) -> Edge:
         """Edge from `a`, by the structure of that frame."""
         across, along = trust(found.apart, a.normal, self.options)
-        share = framed(a, found.moved, self.options.border)
-        share = share if found.alike is None else share * found.alike
-        across, along = across * share, along * share
+        across, along = across * found.share, along * found.share
         normal = None
         if found.flow is not None:
             normal = turned(a, found.flow, self.options.turn_reach)

@@ -194,24 +194,23 @@ def framed(a: FlowFrame, moved: Array, border: float) -> Array:
     Returns:
         [h,w], 1 or a quarter; a match that leaves the picture has a quarter, too.
     """
-    height, width = a.grey.shape
-    last = np.array([width - 1, height - 1], np.float32)
     ends = (a.centres, a.centres + moved)
-    inside = np.min([np.minimum(end, last - end).min(axis=-1) for end in ends], axis=0)
+    inside = np.minimum(*(_from_border(end, a.grey.shape) for end in ends))
     share: Array = np.where(inside < border, np.float32(_FRAMED), np.float32(1.0))
     return share
+
+
+def _from_border(points: Array, size: tuple[int, ...]) -> Array:
+    """Pixels from each point [h,w,2] to the border of a picture of H, W; < 0 outside, [h,w]."""
+    last = np.array([size[1] - 1, size[0] - 1], np.float32)
+    distance: Array = np.minimum(points, last - points).min(axis=-1)
+    return distance
 
 
 def agreement(a: FlowFrame, b: FlowFrame, moved: Array) -> Array:
     """Agreement [h,w] in brightness at both ends of the flow, and 0 outside the picture."""
     there = a.centres + moved
-    height, width = a.grey.shape
-    inside = (
-        (there[..., 0] >= 0)
-        & (there[..., 1] >= 0)
-        & (there[..., 0] <= width - 1)
-        & (there[..., 1] <= height - 1)
-    )
+    inside = _from_border(there, a.grey.shape) >= 0
     difference = np.abs(sample(a.grey, a.centres) - sample(b.grey, there))
     # A change of brightness by 10 grey levels is worth two pixels of position where the
     # picture is steep and says nothing where it is flat: texture decides there.

@@ -96,14 +96,14 @@ class Found:
     Attributes:
         moved: [h,w,2] displacement, pixels.
         apart: [h,w,2] where the way there and back ends, seen from its start, pixels.
-        alike: [h,w] in [0,1], `likeness`; None where it is not asked for.
+        share: [h,w] in [0,1], what `framed` and, if asked for, `likeness` leave of confidence.
         flow: [H,W,2] pixels, where lines that turn are to be followed; else None.
         started: [h,w,2] targets from which the search started; None: free.
     """
 
     moved: Array
     apart: Array
-    alike: Array | None
+    share: Array
     flow: Array | None
     started: Array | None
 
