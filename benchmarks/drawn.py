@@ -2,7 +2,8 @@
 
 Each is a scene with true poses (real, or rendered with a seed of its own), a part of it, mirrored
 or in reverse or at half the frame rate, and one or two of what moves in real clips over it, at a
-size, place and time that are drawn too; then exposure that swings, and JPEG.
+size, place and time that are drawn too; then exposure that swings, and JPEG. What moves or comes
+near too much is drawn again.
 
     python benchmarks/drawn.py DATA OUT [--count 8] [--seed 0]
     droidw run OUT/NAME --preset cpu threads=1
@@ -37,6 +38,7 @@ MOVERS = ("composite_kitchen", "composite_hospital", "davis_parkour", "davis_car
 SIZES: tuple[Size, ...] = ((320, 240), (320, 240), (400, 300), (480, 360))
 SHARE = 0.05, 0.4  # of the pixels that may move; others are drawn again
 LEAST_FRAMES = 90
+CLEARANCE = 0.4  # metres; a camera that comes nearer to a rendered thing may pass through it
 
 
 @dataclass(frozen=True)
@@ -94,8 +96,8 @@ def draw(rng: np.random.Generator) -> Drawn:
     )
 
 
-def still(data: Path, drawn: Drawn) -> Clip:
-    """The scene of a clip, without what moves."""
+def still(data: Path, drawn: Drawn) -> Clip | None:
+    """The scene of a clip, without what moves; None if the camera runs into it."""
     if drawn.scene in REAL:
         clip = read_clip(data / drawn.scene, drawn.size)
         last = len(clip.pictures)
@@ -107,8 +109,10 @@ def still(data: Path, drawn: Drawn) -> Clip:
     elif drawn.scene in ROOMS:
         clip = _room(drawn)
     else:
-        made = replace(SCENERY[drawn.scene], frames=drawn.frames)
-        clip = Renderer(made, drawn.seed).clip()
+        renderer = Renderer(replace(SCENERY[drawn.scene], frames=drawn.frames), drawn.seed)
+        if renderer.clearance() < CLEARANCE:
+            return None
+        clip = renderer.clip()
     clip = replace(clip, masks=[])
     clip = clip.reversed() if drawn.backwards else clip
     return clip.mirrored() if drawn.mirrored else clip
@@ -160,6 +164,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     while made < asked.count:
         drawn = draw(rng)
         alone = still(asked.data, drawn)
+        if alone is None:
+            continue
         layers = [m.layer(asked.data, alone.size, len(alone.pictures)) for m in drawn.movers]
         clip = alone.under(layers)
         if not SHARE[0] <= clip.moving <= SHARE[1]:

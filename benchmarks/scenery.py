@@ -104,6 +104,22 @@ class Renderer:
         """Camera to world."""
         return pose_at(self.camera, k / (self.made.frames - 1))
 
+    def clearance(self) -> float:
+        """How near the camera comes to what stands still, in metres along the optical axis."""
+        width, height = self.made.size
+        x, y = (a.ravel().astype(np.float32) for a in np.mgrid[:width:16, :height:16])
+        world = self.world
+        still = [
+            (body, pose_at(path, 0.0))
+            for body, path in zip(world.bodies, world.paths, strict=True)
+            if not body.actor
+        ]
+        bodies, poses = zip(*still, strict=True)
+        return min(
+            float(cast(list(bodies), list(poses), self.pose(k), self.intrinsics, x, y).depth.min())
+            for k in range(self.made.frames)
+        )
+
     def render(self, k: int, moving: bool) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
         """Picture number k [H,W,3], and what in it [H,W] moves."""
         width, height = self.made.size

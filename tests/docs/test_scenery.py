@@ -73,6 +73,11 @@ def test_masks_show_what_drives_and_nothing_else_differs(clips):
     assert middle[0] > middle[1] > middle[2]  # it drives to the left
 
 
+def test_clearance_is_to_what_stands_still(scenery):
+    made = scenery.Made(ahead, (96, 64), 10.0, 3, 1.0, {})
+    assert scenery.Renderer(made, 0).clearance() == pytest.approx(3.0, abs=1e-3)  # not the box
+
+
 def test_a_folder_that_is_there_is_left_alone(tmp_path, scenery):
     with pytest.raises(SystemExit, match="is there already"):
         scenery.main([str(tmp_path), str(tmp_path)])
