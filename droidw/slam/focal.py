@@ -102,7 +102,8 @@ def refine_focal(
     graph holds. The energy counts the prior of `camera.focal_trust` (a tenth of it for a guess),
     and how far lines are from three directions at right angles, where these count: that tells a
     focal length to some tenths of a per cent. Matches have their own bias, so that a calibration
-    which differs from what is found by less than `camera.focal_slack` stays as it is.
+    stays as it is where what is found differs by less than `camera.focal_slack`, and where the
+    energy by itself is no valley as steep as the prior: it says little then but its bias.
 
     Args:
         known: the focal length is a calibration, not a guess.
@@ -138,12 +139,23 @@ def refine_focal(
 
     trust, bound = camera.focal_trust, camera.focal_range
     x, tried = minimise_with_prior(energy, trust if known else _GUESSED * trust, bound)
-    if known and abs(x) < camera.focal_slack:
+    if known and (abs(x) < camera.focal_slack or not _tells(tried, trust)):
         x = 0.0
     place(x)
     optimiser.upright.measure()
     store.write(*states[x])
     return FocalSearch(math.exp(x), tuple((math.exp(k), value) for k, value in tried))
+
+
+def _tells(tried: list[tuple[float, float]], trust: float) -> bool:
+    """Whether measurements hold a focal length at least as hard as its prior does.
+
+    Args:
+        tried: (x, energy with prior) of `minimise_with_prior`; the first three are 0 and one step
+            to either side.
+    """
+    (_, at_zero), (step, right), (_, left) = tried[:3]
+    return right + left - 2 * at_zero >= 2 * trust * step * step * at_zero
 
 
 def _vertex(points: list[tuple[float, float]]) -> float | None:

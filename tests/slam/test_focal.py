@@ -143,6 +143,22 @@ def test_a_calibration_that_is_off_by_less_than_the_search_is_exact_stays(bench,
             assert found.factor * wrong == pytest.approx(1.0, abs=0.003)
 
 
+@pytest.mark.parametrize(("noise", "moves"), [(0.02, True), (1.0, False)])
+def test_a_calibration_stays_where_measurements_hold_it_less_than_its_prior(bench, noise, moves):
+    """Noise is energy, and beside more of it the same valley is shallower."""
+    for known in (True, False):
+        optimiser, graph, _ = bench(wrong=1.08)
+        drawn = torch.randn(graph.target.shape, generator=torch.Generator().manual_seed(0))
+        graph.target += noise * drawn
+        camera = CameraConfig(focal_slack=0.0)
+        found = refine_focal(optimiser, graph, PHASE, SOLVER, camera, known)
+        (_, at_zero), (factor, right), (_, left) = found.tried[:3]
+        trust = camera.focal_trust * (1.0 if known else 0.1)
+        own = (right + left) / at_zero - 2 - trust * math.log(factor) ** 2
+        assert (own > 10.0 * math.log(factor) ** 2) is moves
+        assert (found.factor == 1.0) is (known and not moves)
+
+
 def test_a_guess_moves_where_a_calibration_holds(bench):
     factors = []
     for known in (True, False):

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
-from droidw.geometry.projective import pixel_grid
 from droidw.interfaces.correspondence import Motion, Purpose
 from droidw.solve.weights import CLOSED
+from droidw_plugins.correspondence._flow_exposure import as_bright, brightened
 from droidw_plugins.correspondence._flow_information import (
     agreement,
     framed,
@@ -36,6 +36,7 @@ from droidw_plugins.correspondence._flow_mask import (
 )
 from droidw_plugins.correspondence._flow_motion import picture_motion
 from droidw_plugins.correspondence._flow_polish import polished
+from droidw_plugins.correspondence._flow_raster import Raster
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import (
@@ -83,8 +84,7 @@ class FlowCorrespondence:
         self.stride = options.stride
         self.offset = (options.stride - 1) / 2
         self._track: Track | None = None
-        self._placed: tuple[tuple[int, int], Any, Any] | None = None
-        self._raster: Array | None = None
+        self._raster = Raster(self.stride, self.offset)
         workers = options.workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
         self._local = threading.local()
@@ -134,7 +134,7 @@ class FlowCorrespondence:
         flow = self._search(reference, current, start)
         self._latest = (reference.key, current.key), flow
         moved = self._moved(reference, current, lambda a, b: flow)
-        agrees = agreement(reference, current, moved)
+        agrees = agreement(reference, current, moved, self._gain(reference, current, moved))
         motion = picture_motion(moved, agrees, reference, self.options)
         known = motion.matched > _TRACKED
         self._track = Track.after(self._track, reference, current, flow) if known else None
@@ -193,8 +193,14 @@ class FlowCorrespondence:
             if near and room and hasattr(engine, "setCoarsestScale"):  # OpenCV from 4.13 on
                 engine.setCoarsestScale(max(scale, _NEAR_SCALE))
             setattr(self._local, name, engine)
-        flow: Array = engine.calc(a.grey, b.grey, None if start is None else start.copy())
+        moved = None if start is None else sample(start, a.centres)
+        grey = as_bright(b.grey, self._gain(a, b, moved))
+        flow: Array = engine.calc(a.grey, grey, None if start is None else start.copy())
         return flow
+
+    def _gain(self, a: FlowFrame, b: FlowFrame, moved: Array | None) -> float:
+        """What exposure made of brightness from `a` to `b`, if that is asked for."""
+        return brightened(a, b, moved) if self.options.exposure else 1.0
 
     def _free(self, a: FlowFrame, b: FlowFrame) -> Array:
         """Flow a -> b without geometry: the motion filter's, where it made b a keyframe."""
@@ -217,7 +223,8 @@ class FlowCorrespondence:
         """Edge a -> b without the way back, exact at full size."""
         found = self._moved(a, b, self._search)
         moved = polished(a.grey, b.grey, a.centres, found, self.options.fill_window)
-        agrees = agreement(a, b, moved) * framed(a, moved, self.options.border)
+        agrees = agreement(a, b, moved, self._gain(a, b, moved))
+        agrees *= framed(a, moved, self.options.border)
         confidence = information(a, agrees, agrees, self.options)
         target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, None)
@@ -314,39 +321,10 @@ class FlowCorrespondence:
     def _started(self, a: FlowFrame, b: FlowFrame, start: Array | None, fine: bool) -> Array:
         """Dense flow a -> b from these targets; without, as the motion filter searches."""
         if start is not None:
-            return self._search(a, b, self._dense(start, a), fine)
+            return self._search(a, b, self._raster.dense(start, a), fine)
         if a.bridged is None and b.bridged is None:
             return self._free(a, b)
         return self._search(a, b, None, fine)
-
-    def _dense(self, target: Array, a: FlowFrame) -> Array:
-        """Grid targets [h,w,2] in cells as a full flow field [H,W,2] in pixels."""
-        flow = target * self.stride + self.offset - a.centres
-        height, width = a.grey.shape
-        map_x, map_y = self._maps(height, width)
-        dense = cv2.remap(
-            np.ascontiguousarray(flow, dtype=np.float32),
-            map_x,
-            map_y,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        bounded: Array = np.clip(dense, -2.0 * width, 2.0 * width).astype(np.float32)
-        return bounded
-
-    def _maps(self, height: int, width: int) -> tuple[Any, Any]:
-        """Where every pixel lies on the grid, in the form that `cv2.remap` likes best."""
-        if self._placed is None or self._placed[0] != (height, width):
-            rows = np.float32(np.clip((np.arange(height) - self.offset) / self.stride, 0, None))
-            cols = np.float32(np.clip((np.arange(width) - self.offset) / self.stride, 0, None))
-            self._placed = ((height, width), *np.meshgrid(cols, rows))
-        return self._placed[1], self._placed[2]
-
-    def _pixels(self, height: int, width: int) -> Array:
-        """Coordinates x, y of all pixels, [H,W,2]."""
-        if self._raster is None or self._raster.shape[:2] != (height, width):
-            self._raster = pixel_grid(height, width).numpy()
-        return self._raster
 
     def _found_both(
         self,
@@ -365,8 +343,9 @@ class FlowCorrespondence:
         apart = moved + sample(ba, a.centres + moved, outside=1e4)
         share = framed(a, moved, self.options.border)
         if self.options.likeness > 0:
-            pixels = self._pixels(*a.grey.shape)
-            share = share * likeness(a, b, ab, pixels, self.options.likeness)
+            pixels = self._raster.pixels(*a.grey.shape)
+            gain = self._gain(a, b, moved)
+            share = share * likeness(a, b, ab, pixels, self.options.likeness, gain)
         return Found(moved, apart, share, ab if self.options.turn_reach else None, started)
 
     def _checked_both(

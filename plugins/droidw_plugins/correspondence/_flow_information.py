@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "agreement",
     "framed",
+    "from_border",
     "information",
     "likeness",
     "powers",
@@ -132,7 +133,9 @@ def trust(apart: Array, normal: Array, options: FlowOptions) -> tuple[Array, Arr
     return first.astype(np.float32), second.astype(np.float32)
 
 
-def likeness(a: FlowFrame, b: FlowFrame, flow: Array, pixels: Array, error: float) -> Array:
+def likeness(
+    a: FlowFrame, b: FlowFrame, flow: Array, pixels: Array, error: float, gain: float = 1.0
+) -> Array:
     """How far the neighbourhood of each cell looks alike at both ends of a flow, [h,w] in [0,1].
 
     A search both ways that sets out from the same wrong geometry comes back to where it began. What
@@ -144,8 +147,9 @@ def likeness(a: FlowFrame, b: FlowFrame, flow: Array, pixels: Array, error: floa
         a, b: frames; what was searched is `a.grey` in `b.grey`.
         flow: [H,W,2] pixels. pixels: [H,W,2] coordinates x, y of the pixels.
         error: pixels.
+        gain: of brightness, from `a` to `b`.
     """
-    apart = a.grey - sample(b.grey, pixels + flow)
+    apart = a.grey - sample(b.grey, pixels + flow) / np.float32(gain)
     window = (2 * a.stride - 1, 2 * a.stride - 1)
     mean, square = (
         sample(cv2.blur(p, window, borderType=cv2.BORDER_REPLICATE), a.centres)
@@ -195,23 +199,28 @@ def framed(a: FlowFrame, moved: Array, border: float) -> Array:
         [h,w], 1 or a quarter; a match that leaves the picture has a quarter, too.
     """
     ends = (a.centres, a.centres + moved)
-    inside = np.minimum(*(_from_border(end, a.grey.shape) for end in ends))
+    inside = np.minimum(*(from_border(end, a.grey.shape) for end in ends))
     share: Array = np.where(inside < border, np.float32(_FRAMED), np.float32(1.0))
     return share
 
 
-def _from_border(points: Array, size: tuple[int, ...]) -> Array:
+def from_border(points: Array, size: tuple[int, ...]) -> Array:
     """Pixels from each point [h,w,2] to the border of a picture of H, W; < 0 outside, [h,w]."""
     last = np.array([size[1] - 1, size[0] - 1], np.float32)
     distance: Array = np.minimum(points, last - points).min(axis=-1)
     return distance
 
 
-def agreement(a: FlowFrame, b: FlowFrame, moved: Array) -> Array:
-    """Agreement [h,w] in brightness at both ends of the flow, and 0 outside the picture."""
+def agreement(a: FlowFrame, b: FlowFrame, moved: Array, gain: float = 1.0) -> Array:
+    """Agreement [h,w] in brightness at both ends of the flow, and 0 outside the picture.
+
+    Args:
+        moved: [h,w,2] displacement of the cells, pixels.
+        gain: of brightness, from `a` to `b`.
+    """
     there = a.centres + moved
-    inside = _from_border(there, a.grey.shape) >= 0
-    difference = np.abs(sample(a.grey, a.centres) - sample(b.grey, there))
+    inside = from_border(there, a.grey.shape) >= 0
+    difference = np.abs(sample(a.grey, a.centres) * np.float32(gain) - sample(b.grey, there))
     # A change of brightness by 10 grey levels is worth two pixels of position where the
     # picture is steep and says nothing where it is flat: texture decides there.
     tolerance = 6.0 + 1.5 * a.texture.max(axis=-1)

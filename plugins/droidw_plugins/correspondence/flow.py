@@ -122,6 +122,13 @@ class FlowOptions:
             "le": 32.0,
         },
     )
+    exposure: bool = field(
+        default=True,
+        metadata={
+            "help": "what all of a picture has become brighter or darker is taken out before it is "
+            "searched or compared (false: exposure is taken to be the same)"
+        },
+    )
     restart: float = field(
         default=2.0,
         metadata={
