@@ -222,8 +222,10 @@ class FlowCorrespondence:
     def one_way(self, a: FlowFrame, b: FlowFrame) -> Edge:
         """Edge a -> b without the way back, exact at full size."""
         found = self._moved(a, b, self._search)
-        moved = polished(a.grey, b.grey, a.centres, found, self.options.fill_window)
-        agrees = agreement(a, b, moved, self._gain(a, b, moved))
+        gain = self._gain(a, b, found)
+        grey = as_bright(b.grey, gain)
+        moved = polished(a.grey, grey, a.centres, found, self.options.fill_window)
+        agrees = agreement(a, b, moved, gain)
         agrees *= framed(a, moved, self.options.border)
         confidence = information(a, agrees, agrees, self.options)
         target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
