@@ -22,17 +22,17 @@ __all__ = ["as_bright", "brightened"]
 
 # Grey levels that are neither black nor white.
 _DARK, _BRIGHT = 8.0, 247.0
-# A change of brightness (its logarithm) that is none: walls shine as they are looked at. And the
-# largest one: beyond it another thing is there.
-_STEADY, _MOST = 0.01, math.log(2.0)
+# A change of brightness (its logarithm) that is none, and the largest one: beyond it another thing
+# is there.
+_STEADY, _MOST = 0.005, math.log(2.0)
 
 
 def brightened(a: FlowFrame, b: FlowFrame, moved: Array | None) -> float:
     """How many times as bright things are in `b` as in `a`.
 
     It is the median over cells that are neither black nor white, so that it hardly matters where
-    some of them are: a wall is as bright a pixel further on. A hundredth more or less is no change,
-    and what is more counts from there.
+    some of them are: a wall is as bright a pixel further on. Half a hundredth is no change: to
+    divide by it would round every pixel anew, for less than a grey level.
 
     Args:
         moved: [h,w,2] displacement of the cells, pixels; None: nowhere.
@@ -47,7 +47,7 @@ def brightened(a: FlowFrame, b: FlowFrame, moved: Array | None) -> float:
     if not known.any():
         return 1.0
     change = float(np.median(np.log(there[known] / here[known])))
-    return math.exp(math.copysign(min(max(abs(change) - _STEADY, 0.0), _MOST), change))
+    return 1.0 if abs(change) < _STEADY else math.exp(min(max(change, -_MOST), _MOST))
 
 
 def as_bright(grey: npt.NDArray[np.uint8], gain: float) -> npt.NDArray[np.uint8]:
