@@ -113,7 +113,6 @@ def still(data: Path, drawn: Drawn) -> Clip | None:
         if renderer.clearance() < CLEARANCE:
             return None
         clip = renderer.clip()
-    clip = replace(clip, masks=[])
     clip = clip.reversed() if drawn.backwards else clip
     return clip.mirrored() if drawn.mirrored else clip
 
