@@ -291,8 +291,8 @@ class Optimiser:
             max_disp=weighting.max_disp or None,
             pairs=edges.pairs,
         )
-        problem = replace(problem, pose_term=self._known(problem, low, motion_prior))
-        problem = redescended(problem, solver)
+        known = self._known(problem, low, motion_prior, settled=solver.cauchy_tuning > 0)
+        problem = redescended(replace(problem, pose_term=known), solver)
         problem = self.upright.flat(problem, gates, solver.planes * self.usual)
         step = self.parts.ba.step(problem)
         self._note(step.report)
@@ -300,16 +300,16 @@ class Optimiser:
         store.T_cw[low:] = step.T_cw[:count]
         store.disps[low:] = step.disps[:count]
 
-    def _known(self, problem: BAProblem, low: int, motion_prior: float) -> PoseTerm | None:
+    def _known(self, problem: BAProblem, low: int, steady: float, settled: bool) -> PoseTerm | None:
         """What is known of the poses from `low` on besides matches."""
         points = self.points if low == 0 else None
-        if motion_prior <= 0 and points is None and not self.upright.holds:
+        if steady <= 0 and points is None and not self.upright.holds:
             return None
         usual = self.usual = usual_square(problem)
-        said = [self.upright.term(problem.T_cw, low, usual)]
-        if motion_prior > 0:
+        said = [self.upright.term(problem.T_cw, low, usual, settled)]
+        if steady > 0:
             times = torch.tensor(self.store.times()[low:], dtype=torch.float64)
-            said.append(steady_motion(problem.T_cw, times, motion_prior * usual))
+            said.append(steady_motion(problem.T_cw, times, steady * usual))
         if points is not None:
             said.append(epipolar_term(problem.T_cw, points[0], points[1] * usual))
         terms = [term for term in said if term is not None]

@@ -19,6 +19,7 @@ from droidw.solve.manhattan import (
     axes_in_turn,
     next_axes,
     rotation_term,
+    shared_axes,
 )
 from droidw.solve.planes import held_to_planes
 from droidw.solve.weights import CLOSED
@@ -187,11 +188,14 @@ class Upright:
         turned[:, 3] = pose[:3] if still else -turned[:, :3] @ centre
         store.T_cw[number] = from_matrix(turned).to(store.T_cw)
 
-    def term(self, T_cw: Tensor, first: int, usual: float) -> PoseTerm | None:
+    def term(
+        self, T_cw: Tensor, first: int, usual: float, settled: bool = False
+    ) -> PoseTerm | None:
         """What lines say of the poses [N,7] of the keyframes from `first` on.
 
         Args:
             usual: square of a usual residual, the unit in which they count.
+            settled: as of `rotation_term`.
         """
         store = self._store
         known = self._known() if self.holds else []
@@ -199,7 +203,8 @@ class Upright:
             return None
         information = store["axes_information"][first:]
         weight = self._weight * usual
-        return rotation_term(T_cw, store["axes"][first:], information, self._world(known), weight)
+        world = self._shared(known)
+        return rotation_term(T_cw, store["axes"][first:], information, world, weight, settled)
 
     def flat(self, problem: BAProblem, gates: Tensor, weight: float) -> BAProblem:
         """A problem of all keyframes with walls and floors held to be flat, where lines count.
@@ -212,7 +217,7 @@ class Upright:
         """
         if not self.holds or weight <= 0 or len(problem.T_cw) < len(self._store):
             return problem
-        return held_to_planes(problem, self._world(self._known()), gates, weight)
+        return held_to_planes(problem, self._shared(self._known()), gates, weight)
 
     def _known(self) -> list[int]:
         """Keyframes whose axes count."""
@@ -222,13 +227,17 @@ class Upright:
     def _world(self, known: list[int]) -> Tensor:
         """[3,3] float64 from the axes to the world: as the first keyframe that has them sees it.
 
-        The first pose is held while others move, so it is what they go by.
+        The first pose is held while others move, so it is what a path that is not known goes by.
         """
+        return self._shared(known[:1])
+
+    def _shared(self, known: list[int]) -> Tensor:
+        """The same as most of the keyframes see it that agree with the first."""
         store = self._store
         if not known:
             return torch.eye(3, dtype=torch.float64, device=store.device)
-        R = rotation(store.T_cw[known[0]].double())
-        return R.mT @ store["axes"][known[0]]
+        at = upload(torch.tensor(known), store.device)
+        return shared_axes(store.T_cw[at], store["axes"][at], store["axes_information"][at])
 
     def _lines(self, number: int) -> npt.NDArray[np.float32]:
         lines = self._store.infos[number].lines

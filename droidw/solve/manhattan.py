@@ -19,7 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from droidw.geometry.se3 import from_matrix, log, rotation
+from droidw.geometry.se3 import exp, from_matrix, log, rotation
 from droidw.solve.problem import PoseTerm
 
 __all__ = [
@@ -29,6 +29,7 @@ __all__ = [
     "named_like",
     "next_axes",
     "rotation_term",
+    "shared_axes",
 ]
 
 Array = npt.NDArray[np.float64]
@@ -54,8 +55,11 @@ _LEAST = 6
 _AGREES = np.radians(1.2)
 # Radians from one picture to the next by which directions are still followed.
 _FOLLOWED = np.radians(20.0)
-# Radians from what lines say at which a pose is hardly held to it any more.
+# Radians from what lines say at which a pose is hardly held to it any more; where the path is
+# settled so many times what is usual, and that much at least.
 _MISLED = np.radians(1.0)
+_TIMES, _MISLED_LEAST = 4.0, np.radians(0.25)
+_SHARED_ROUNDS = 6
 # Pictures of a sequence from each of which the others are tried to be followed; radians from what
 # has been followed through a picture below which a start there leads to the same.
 _SEEDS, _SAME = 6, np.radians(2.0)
@@ -280,29 +284,72 @@ def _cost(pictures: Sequence[LineRays], chain: dict[int, Axes]) -> float:
     return sum(float(pictures[k].cost(axes.turn)) for k, axes in chain.items())
 
 
+def shared_axes(T_cw: Tensor, turns: Tensor, information: Tensor) -> Tensor:
+    """Rotation [3,3] float64 from the axes to the world, as most cameras see it.
+
+    The axes of one picture are off by a tenth of a degree or three, and all would be turned by that
+    against the one they go by. Found from what the first camera says, by those that agree with it
+    to a degree or so: a path that is bent by more is measured from its beginning, which is held.
+
+    Args:
+        T_cw: [N,7] poses, world to camera, N >= 1.
+        turns, information: [N,3,3] of `Axes`.
+    """
+    R = rotation(T_cw.double())
+    turns, H = turns.to(R), R.mT @ information.to(R) @ R
+    upright = R[0].mT @ turns[0]
+    for _ in range(_SHARED_ROUNDS):
+        off = _rotation_vector(R.mT @ turns @ upright.mT)
+        weighed = _kept(off, _MISLED).square()[:, None, None] * H
+        step = torch.linalg.lstsq(weighed.sum(0), (weighed @ off[..., None]).sum(0)).solution
+        upright = rotation(exp(torch.nn.functional.pad(step[:, 0], (3, 0)))) @ upright
+    return upright
+
+
 def rotation_term(
-    T_cw: Tensor, turns: Tensor, information: Tensor, upright: Tensor, weight: float
+    T_cw: Tensor,
+    turns: Tensor,
+    information: Tensor,
+    upright: Tensor,
+    weight: float,
+    settled: bool = False,
 ) -> PoseTerm:
     """The energy `weight * w^T H w` of how far each camera is turned from what its lines say.
 
     w is the rotation vector from the one to the other. Linearised, and by a Cauchy kernel: one
-    picture in many takes other lines for the axes, and matches know better by then.
+    picture in many takes other lines for the axes, and matches know better by then. It is as sure
+    of them as others are of theirs, so that even the little that this kernel leaves drags its pose.
+    Once the others are where their lines say, the kernel of Geman and McClure leaves nothing.
 
     Args:
         T_cw: [N,7] poses, world to camera.
         turns, information: [N,3,3] of `Axes`; H is 0 where they are not known.
         upright: [3,3] rotation from the axes to the world.
         weight: in the units of the energy of `BAProblem`, per unit of information.
+        settled: the path is hardly bent any more; the kernel is four times what is usual wide.
     """
     R = rotation(T_cw.double())
     off = _rotation_vector(turns.to(R) @ upright.to(R).mT @ R.mT)
-    kept = 1.0 / (1.0 + (off / _MISLED).square().sum(dim=1))
+    if settled:
+        angle = off.norm(dim=1)[information.flatten(1).any(dim=1)]
+        usual = float(angle.median()) if len(angle) else 0.0
+        kept = _kept(off, min(max(_TIMES * usual, _MISLED_LEAST), _MISLED)).square()
+    else:
+        kept = _kept(off, _MISLED)
     H = weight * kept[:, None, None] * information.to(R)
     band = torch.zeros(len(R), 1, 6, 6, dtype=R.dtype, device=R.device)
     rhs = torch.zeros(len(R), 6, dtype=R.dtype, device=R.device)
     band[:, 0, 3:, 3:] = H
     rhs[:, 3:] = (H @ off[..., None])[..., 0]
     return PoseTerm(band, rhs)
+
+
+def _kept(off: Tensor, width: float) -> Tensor:
+    """Share [N] that a Cauchy kernel leaves of rotation vectors [N,3].
+
+    Its square is what the kernel of Geman and McClure leaves.
+    """
+    return (1.0 + (off / width).square().sum(dim=1)).reciprocal()
 
 
 def _rotation_vector(R: Tensor) -> Tensor:

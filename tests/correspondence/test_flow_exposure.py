@@ -56,6 +56,20 @@ def test_what_moves_has_no_say_while_it_is_the_smaller_part(scene):
     assert brightened(frame_of(first), frame_of(second), None) == pytest.approx(1.2, abs=0.03)
 
 
+@pytest.mark.parametrize("gain", [1.0, 0.9, 1.15])
+def test_what_is_covered_does_not_sway_what_is_left(scene, gain):
+    """Things that are brighter, each in its way, cover two fifths: the median is off by far."""
+    rng = np.random.default_rng(5)
+    brighter = rng.uniform(1.02, 1.4, scene.shape)
+    brighter[:, 10 + int(0.4 * WIDTH) :] = 1.0
+    brighter *= rng.normal(1.0, 0.02, scene.shape)
+    first, second = frame_of(seen(scene, 10)), frame_of(seen(scene * brighter, 10, gain))
+    assert np.median(second.grey / first.grey) > 1.01 * gain
+    found = brightened(first, second, None)
+    assert found == pytest.approx(gain, abs=0.008)
+    assert found == 1.0 or gain != 1.0
+
+
 @pytest.mark.parametrize(("level", "known"), [(0, 1.0), (255, 1.0), (240, 2.0)])
 def test_black_and_white_say_nothing_and_twice_is_the_most(scene, level, known):
     first = frame_of(np.full((HEIGHT, WIDTH), 60, np.uint8))

@@ -14,6 +14,7 @@ from droidw.solve.manhattan import (
     named_like,
     next_axes,
     rotation_term,
+    shared_axes,
 )
 
 INTRINSICS = (200.0, 210.0, 160.0, 120.0)
@@ -179,6 +180,13 @@ def test_the_term_is_what_differentiation_finds():
     assert float(energy(step)) < 1e-3 * float(energy(torch.zeros_like(step)))
 
 
+def off_by(degrees, T, upright):
+    """What lines say of cameras that are turned by so much each about one of their axes."""
+    about = torch.eye(3, dtype=torch.float64).repeat(len(T), 1)[: len(T)]
+    vectors = torch.nn.functional.pad(torch.deg2rad(degrees)[:, None] * about, (3, 0))
+    return se3.rotation(se3.exp(vectors)) @ se3.rotation(T) @ upright
+
+
 def test_a_picture_that_is_misled_hardly_pulls():
     T, H, upright = poses(1), information(1), torch.from_numpy(TURN)
     pulls = []
@@ -187,6 +195,43 @@ def test_a_picture_that_is_misled_hardly_pulls():
         pulls.append(float(rotation_term(T, turns, H, upright, 1.0).rhs.norm()) / degrees)
     assert pulls[0] > 1.9 * pulls[1] > 0
     assert pulls[0] == pytest.approx(50 * pulls[2], rel=0.02)
+
+
+def test_nor_does_it_pull_at_all_once_the_others_are_settled():
+    T, H, upright = poses(9), torch.eye(3).double().expand(9, 3, 3), torch.from_numpy(TURN)
+    pulls = []
+    for degrees in (0.1, 1.0, 2.5):
+        each = torch.tensor([0.1] * 8 + [degrees], dtype=torch.float64)
+        term = rotation_term(T, off_by(each, T, upright), H, upright, 1.0, settled=True)
+        pulls.append(term.rhs.norm(dim=1))
+    assert float(pulls[0].min()) > 0.8 * np.radians(0.1)
+    assert float(pulls[1][-1]) < 0.25 * float(pulls[0][-1])
+    assert float(pulls[2][-1]) < 0.02 * float(pulls[0][-1])
+    # where all are off, none is misled
+    each = torch.full((9,), 1.0, dtype=torch.float64)
+    term = rotation_term(T, off_by(each, T, upright), H, upright, 1.0, settled=True)
+    assert float(term.rhs.norm(dim=1).min()) > 0.2 * np.radians(1.0)
+
+
+def test_what_all_go_by_is_better_known_than_by_the_first_picture():
+    T, H, upright = poses(60), torch.eye(3).double().expand(60, 3, 3), torch.from_numpy(TURN)
+    each = 0.2 * torch.randn(60, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    each[0], each[7] = 0.5, 30.0
+    found = shared_axes(T, off_by(each, T, upright), H)
+    assert angle(found.numpy(), TURN) < 0.06
+    alone = shared_axes(T[:1], off_by(each, T, upright)[:1], H[:1])
+    assert angle(alone.numpy(), TURN) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_where_a_path_is_bent_all_go_by_its_beginning():
+    """Else the first pose, which is held, would be left behind."""
+    T, H, upright = poses(60), torch.eye(3).double().expand(60, 3, 3), torch.from_numpy(TURN)
+    each = torch.zeros(60, dtype=torch.float64)
+    each[10:] = 12.0
+    about = torch.zeros(60, 6, dtype=torch.float64)
+    about[:, 4] = torch.deg2rad(each)
+    turns = se3.rotation(T) @ se3.rotation(se3.exp(about)) @ upright
+    assert angle(shared_axes(T, turns, H).numpy(), TURN) < 0.05
 
 
 def test_the_term_is_silent_where_lines_are():
