@@ -28,9 +28,9 @@ _DARK, _BRIGHT = 8.0, 247.0
 # is there.
 _STEADY, _MOST = 0.005, math.log(2.0)
 # What is as bright as a change says it would be lies within this share of the spread of all
-# changes, and within these bounds; where as much of it does without a change, there was none.
+# changes, and within these bounds; where nearly as many do without a change, there was none.
 _WIDTH, _NARROWEST, _WIDEST = 0.6, 0.02, 0.1
-_AS_MUCH = 0.95
+_AS_MUCH = 0.9
 _ROUNDS = 10
 
 
