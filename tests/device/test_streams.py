@@ -25,6 +25,8 @@ FLOW = (
     # softened, or with their border at a quarter, its pictures hold a path even less
     "correspondence.options.blur=0",
     "correspondence.options.border=0",
+    # and whether exposure has changed by half of a hundredth is a matter of rounding
+    "correspondence.options.exposure=false",
 )
 DROID = ("--preset", "droid-slam", "correspondence.options={precision: float32, store: float}",
          "uncertainty=affine-softplus", "features=fit3d", "frontend.predict=velocity")  # fmt: skip
