@@ -260,6 +260,11 @@ class FillerConfig:
 
     updates: int = opt(2, "motion-only update steps per batch", ge=0)
     keyframes: int = opt(2, "keyframes on either side that a frame is measured from", ge=1)
+    smooth: bool = opt(
+        True,
+        "draw frames between keyframes to a steady motion, by how exact they are and how much the "
+        "camera shakes, both read from the path",
+    )
     batch: int = opt(16, "frames per batch", ge=1)
     cache_mb: int = opt(
         512, "memory for what correspondence keeps of frames; beyond it they are read again", ge=0

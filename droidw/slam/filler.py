@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
 from droidw.geometry.interpolate import interpolate
 from droidw.geometry.se3 import exp, inv, log, mul
 from droidw.slam.locate import locate
+from droidw.slam.smoothing import smoothed
 
 if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig
@@ -22,7 +25,7 @@ __all__ = ["Filler"]
 
 
 class Filler:
-    """Interpolates a frame between its two keyframes, then refines it, motion only."""
+    """Interpolates a frame between its two keyframes, refines it, motion only, and smooths all."""
 
     def __init__(self, optimiser: Optimiser, config: DroidwConfig) -> None:
         self.optimiser = optimiser
@@ -69,6 +72,15 @@ class Filler:
         if updates == 0 or len(self._times) < 2:
             return list(start.unbind(0))
         return list(self._refine(batch, start, updates).unbind(0))
+
+    def smoothed(self, T_cw: Tensor, times: Sequence[float], held: npt.NDArray[np.bool_]) -> Tensor:
+        """The whole path [N,7], float64, with frames that are no keyframes on a steady motion.
+
+        Args:
+            times: [N]. held: [N], keyframes.
+        """
+        options = self.config.filler
+        return smoothed(T_cw, times, held) if options.smooth and options.updates else T_cw
 
     def _refine(self, batch: list[Encoded], start: Tensor, updates: int) -> Tensor:
         return locate(

@@ -363,11 +363,11 @@ class SlamSystem:
             elif index not in poses:
                 poses[index] = filler.start(time)
         T_cw = torch.stack([poses[i] for i in self._indices]).double()
-        return Trajectory(
-            times=np.asarray(self._times, dtype=np.float64),
-            T_wc=inv(T_cw).cpu().numpy(),
-            is_keyframe=np.asarray([filler.is_keyframe(i) for i in self._indices]),
-        )
+        held = np.asarray([filler.is_keyframe(i) for i in self._indices])
+        if not quick:
+            T_cw = filler.smoothed(T_cw, self._times, held)
+        times = np.asarray(self._times, dtype=np.float64)
+        return Trajectory(times=times, T_wc=inv(T_cw).cpu().numpy(), is_keyframe=held)
 
     def _unfilled(self, filler: Filler, reread: Callable[[], Iterable[Frame]]) -> Iterator[Encoded]:
         """Every frame that is no keyframe, from memory or from a second pass."""
