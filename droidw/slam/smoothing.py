@@ -52,10 +52,9 @@ def smoothed(T_cw: Tensor, times: Sequence[float], held: npt.NDArray[np.bool_]) 
     Returns:
         [N,7]; held ones are the same to the byte.
     """
-    dt = np.diff(np.asarray(times, dtype=np.float64))
-    if held.all() or len(dt) < _LEAST + _ERROR or not (dt > 0).all():
-        return T_cw
     stamps = np.asarray(times, dtype=np.float64)
+    if held.all() or len(stamps) <= _LEAST + _ERROR or not (np.diff(stamps) > 0).all():
+        return T_cw
     T = T_cw.cpu().double()
     centres = inv(T)[:, :3].numpy()
     rates = log(mul(T[1:], inv(T[:-1])))[:, 3:].numpy()

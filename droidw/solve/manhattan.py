@@ -298,11 +298,12 @@ def shared_axes(T_cw: Tensor, turns: Tensor, information: Tensor) -> Tensor:
     R = rotation(T_cw.double())
     turns, H = turns.to(R), R.mT @ information.to(R) @ R
     upright = R[0].mT @ turns[0]
-    for _ in range(_SHARED_ROUNDS):
+    for _ in range(_SHARED_ROUNDS if len(R) > 1 else 0):
         off = _rotation_vector(R.mT @ turns @ upright.mT)
         weighed = _kept(off, _MISLED).square()[:, None, None] * H
-        step = torch.linalg.lstsq(weighed.sum(0), (weighed @ off[..., None]).sum(0)).solution
-        upright = rotation(exp(torch.nn.functional.pad(step[:, 0], (3, 0)))) @ upright
+        inverse = torch.linalg.pinv(weighed.sum(0), hermitian=True)
+        step = inverse @ (weighed @ off[..., None]).sum(dim=(0, 2))
+        upright = rotation(exp(torch.nn.functional.pad(step, (3, 0)))) @ upright
     return upright
 
 
