@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from droidw.geometry.se3 import exp, from_matrix, inv, log, mul, rotation
+from droidw.solve.motion import MEDIAN_SQUARE
 
 __all__ = ["smoothed"]
 
@@ -27,8 +28,6 @@ Array = npt.NDArray[np.float64]
 _SHAKES, _ERROR = 3, 5
 # Differences that are needed to tell.
 _LEAST = 20
-# Median of the squared length of three numbers of variance 1.
-_MEDIAN = 2.366
 # What the camera does is this share of the variance of third differences at least.
 _LEAST_SHARE = 0.05
 # Times the usual at which an error, or a jerk, counts by half: a frame that went astray, a camera
@@ -111,7 +110,7 @@ class _Differences:
         known = self.share.any(axis=1)
         if known.sum() < _LEAST:
             return float("nan")
-        return float(np.median(np.square(self(path)[known]).sum(axis=1))) / _MEDIAN
+        return float(np.median(np.square(self(path)[known]).sum(axis=1))) / MEDIAN_SQUARE
 
 
 def _drawn(path: Array, stamps: Array, held: npt.NDArray[np.bool_]) -> Array:

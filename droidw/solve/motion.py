@@ -20,10 +20,11 @@ from droidw.solve.problem import PoseTerm
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["steady_motion"]
+__all__ = ["MEDIAN_SQUARE", "steady_motion"]
 
-# Median of the squared length of three numbers of variance 1.
-_MEDIAN = 2.366
+MEDIAN_SQUARE = 2.366
+"""Median of the squared length of three numbers of variance 1."""
+
 # Keyframes that tell what is usual.
 _LEAST = 8
 # Share of the usual speed below which a camera stands, and has no speed to compare another with.
@@ -72,7 +73,7 @@ def steady_motion(T_cw: Tensor, times: Tensor, weight: float) -> PoseTerm | None
     e, J = [], []
     for change, jacobian, floor in zip((a, b), (J_a, J_b), least, strict=True):
         change, jacobian = change / root[:, None], jacobian / root[:, None, None, None]
-        usual = (change.square().sum(1).median() / _MEDIAN).sqrt().clamp_min(floor)
+        usual = (change.square().sum(1).median() / MEDIAN_SQUARE).sqrt().clamp_min(floor)
         e.append(change / usual)
         J.append(jacobian / usual)
     square = torch.stack([part.square().sum(1) for part in e], dim=1) / 3.0
