@@ -115,7 +115,9 @@ def make_cells(
     for row, row_layer in plan.rows.items():
         for sequence, footage in plan.sequences.items():
             # Resolving takes a while, and sequences and seeds often differ in values alone.
-            same = json.dumps([row, footage.layer[1], footage.vary], default=str)
+            # But for what their dataset says of them.
+            named = footage.source if ":" in footage.source else ""
+            same = json.dumps([row, footage.layer[1], footage.vary, named], default=str)
             if same not in known:
                 source = {"seed": plan.seeds[0], "input": {"source": _place(footage.source)}}
                 varied = override_layers([f"{key}={plan.seeds[0]}" for key in footage.vary])
@@ -203,8 +205,7 @@ def prepare(
         plugin_files: as given with --plugin. data: folder of datasets, or None for the usual one.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for stale in ("failure.json", "result.json"):
-        (folder / stale).unlink(missing_ok=True)
+    (folder / "failure.json").unlink(missing_ok=True)
     with atomic_write(folder / "cell.yaml") as stream:
         stream.write(cell.config.encode("utf-8"))
     spec = {
@@ -225,11 +226,13 @@ def read_outcome(cell: Cell, folder: Path, measure: Measuring) -> Outcome | None
     """What came of a cell earlier, or None if it has to run (again).
 
     A finished cell whose configuration is another now has to; one that is only to be measured
-    differently is measured again from its files.
+    differently is measured again from its files, if they are still there.
     """
     record = _read(folder / "result.json")
     if record is not None and record.get("digest") == cell.digest:
         if record.get("measure") != asdict(measure):
+            if not (folder / "run" / "manifest.json").is_file():
+                return None
             from droidw.ablation.measure import measure_run
 
             record.update(measure_run(folder / "run", measure), measure=asdict(measure))

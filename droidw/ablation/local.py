@@ -26,7 +26,11 @@ _POLL = 0.1
 
 
 def launch(folder: Path) -> subprocess.Popen[bytes]:
-    """Start the process of a cell that has been prepared; what it says goes to `output.txt`."""
+    """Start the process of a cell that has been prepared; what it says goes to `output.txt`.
+
+    What came of it earlier is given up now and no sooner: cells that wait keep theirs.
+    """
+    (folder / "result.json").unlink(missing_ok=True)
     spec = json.loads((folder / "cell.json").read_text(encoding="utf-8"))
     threads = str(spec["threads"])
     limits = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")

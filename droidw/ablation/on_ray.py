@@ -133,6 +133,10 @@ def _run(
             cell, folder = pending.pop(reference)
             try:
                 code, seconds = get(reference)
+            except exceptions.RayTaskError as error:
+                cause = getattr(error, "cause", None) or error
+                why = f"{type(cause).__name__}: {str(cause).splitlines()[0]}"
+                outcome = conclude(folder, 1, 0.0, f"its task failed: {why}")
             except exceptions.RayError as error:
                 lost = f"its worker was lost {RETRIES + 1} times: {str(error).splitlines()[0]}"
                 outcome = conclude(folder, 1, 0.0, lost)

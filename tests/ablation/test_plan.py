@@ -9,7 +9,7 @@ import yaml
 
 from droidw.ablation.cells import make_cells
 from droidw.ablation.plan import load_plan
-from droidw.config.load import packaged_configs
+from droidw.config.load import load_config, packaged_configs
 from droidw.errors import ConfigError, InputError, MissingRequirementError, UsageError
 from droidw.plugin.registry import PluginNotFound
 
@@ -97,6 +97,21 @@ def test_sequences_with_settings_and_sources(tmp_path, plugins):
     cells, _ = make_cells(chosen, plugins)
     assert config(cells[0])["reader"]["options"]["seed"] == 7
     assert (config(cells[1])["input"]["skip"], cells[1].seed) == (7, 7)
+
+
+def test_each_sequence_of_a_dataset_has_its_own_settings(tmp_path, plugins):
+    file = tmp_path / "p.yaml"
+    file.write_text(
+        "preset: paper\nsequences: {a: {source: 'bonn:balloon'}, b: {source: 'tum:f3_walking'}}\n"
+        "rows: {full: {features: none, depth: none, uncertainty: none, correspondence: flow}}\n"
+    )
+    cells, _ = make_cells(load_plan(str(file)), plugins)
+    found = {config(cell)["input"]["source"]: config(cell)["camera"] for cell in cells}
+    for source, camera in found.items():
+        alone = load_config(preset="paper", values={"input.source": source}).data["camera"]
+        assert {key: camera[key] for key in alone} == alone
+    one, other = found.values()
+    assert one != other
 
 
 def test_an_unknown_plugin_is_refused_with_its_row(plan, plugins, tmp_path):

@@ -151,6 +151,15 @@ def test_ray_makes_the_same_table_though_a_worker_is_killed(local, files):
     assert result.stat().st_mtime_ns == before and not more.failures()
 
 
+def test_a_task_of_ray_that_fails_says_why(files, tmp_path):
+    cell = make_cells(load_plan(str(files / "plan.yaml"), rows=["full"]), load_plugins())[0][0]
+    told = []  # nothing was prepared in the folder, as where another machine does not see it
+    run_on_ray([(cell, tmp_path)], lambda _, state, outcome: told.append((state, outcome)), 1)
+    (_, running), (state, outcome) = told
+    assert running is None and state == "failed"
+    assert outcome.error.startswith("its task failed: FileNotFoundError")
+
+
 def test_without_ray_it_is_said(files, monkeypatch):
     absent = SimpleNamespace(util=SimpleNamespace(find_spec=lambda name: None))
     monkeypatch.setattr(on_ray, "importlib", absent)

@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 
-from droidw.ablation.cells import make_cells
+from droidw.ablation import local
+from droidw.ablation.cells import make_cells, prepare, read_outcome
 from droidw.errors import UsageError
 
 
@@ -67,6 +69,20 @@ def test_cells_that_fail_say_why_and_the_table_is_made(plan, go, started, tmp_pa
     count = len(started())
     go(plan(["full", "mute"], sequences=["one"]))
     assert started()[count:] == ["mute/one/0"]
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_a_result_is_kept_until_its_cell_runs_again(plan, go, tmp_path):
+    found = plan(["full"])
+    table, _ = go(found)
+    cell = table.cells[0][0]
+    folder = tmp_path / "out" / "cells" / cell.name
+    prepare(cell, folder, found.measure)
+    assert read_outcome(cell, folder, found.measure) is not None
+    # Measured otherwise, from files that are gone: it runs again.
+    assert read_outcome(cell, folder, replace(found.measure, align="se3")) is None
+    local.end(local.launch(folder))
+    assert read_outcome(cell, folder, found.measure) is None
 
 
 @pytest.mark.usefixtures("stand_in")
