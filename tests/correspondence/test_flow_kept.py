@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from droidw.geometry.camera import Grid
+from droidw.interfaces.correspondence import EdgeRequest
 from droidw_plugins.correspondence._flow_mask import bridge
+from droidw_plugins.correspondence._flow_types import Kept, KeptInRounds
 
 H, W = 120, 160
 
@@ -115,3 +118,51 @@ def test_a_few_cells_more_or_less_need_no_new_search(operator, pair, searches, c
     made.clear()
     ask(part, frames, 6)  # many more than when it was searched
     assert made
+
+
+def test_the_oldest_is_given_up():
+    kept = Kept(2)
+    for key in ("a", "b", "a", "c"):
+        kept.put(key, key)
+    assert [kept.get(key) for key in "abc"] == ["a", None, "c"]
+
+
+@pytest.mark.parametrize("order", ["cab", "bca"])
+def test_what_is_given_up_does_not_depend_on_which_thread_was_first(order):
+    kept = KeptInRounds(2)
+    for key in order:
+        kept.put(key, key)
+        assert kept.get(key) == key
+    assert kept.get(order[0]) == order[0]
+    kept.settle()
+    assert [kept.get(key) for key in "abc"] == [None, "b", "c"]
+    kept.put("b", "anew")
+    kept.settle()
+    kept.put("d", "d")
+    kept.settle()
+    assert [kept.get(key) for key in "bcd"] == ["anew", None, "d"]
+
+
+def test_a_direction_that_is_not_wanted_sets_out_from_its_prediction(operator, pair, monkeypatch):
+    part = operator()
+    a, b = pair(part)
+    height, width = a.normal.shape[:2]
+    still = np.moveaxis(np.mgrid[:height, :width][::-1], 0, -1).astype(np.float32)
+    asked, both_ways = [], part.both_ways
+
+    def heard(one, other, start_ab, start_ba, *rest, **more):
+        asked.append((start_ab, start_ba))
+        return both_ways(one, other, start_ab, start_ba, *rest, **more)
+
+    monkeypatch.setattr(part, "both_ways", heard)
+    session = part.session("global")
+
+    right = np.float32([5 / part.stride, 0])
+    # the second time one of both is said to be where it is not: that one is searched again
+    for there in (right, right + 40):
+        coords = np.stack([still + there, still - right])
+        seen = torch.ones(coords.shape[:3], dtype=torch.bool)
+        known = torch.from_numpy(coords), seen, [a, b].__getitem__
+        session.update(EdgeRequest([0, 1], [0, 1], [1, 0], *known, informed=True))
+    assert len(asked) == 2
+    assert all(np.array_equal(*both) for both in zip(asked[1], coords, strict=True))

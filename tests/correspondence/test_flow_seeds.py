@@ -60,6 +60,18 @@ def test_points_are_found_where_they_went():
     assert np.abs(kept.there - kept.here - SHIFT).max() < 2.5
 
 
+def test_points_lie_in_the_middle_of_what_they_are():
+    y, x = np.mgrid[:120, :160].astype(np.float32)
+    middles = np.random.default_rng(0).uniform(0, 1, (24, 2)) + [
+        (20 * k + 20, 20 * j + 20) for j in range(4) for k in range(6)
+    ]
+    spots = sum(np.exp(-((x - u) ** 2 + (y - v) ** 2) / 12) for u, v in middles)
+    found = detect((40 + 150 * spots).astype(np.uint8), 500).at
+    off = np.stack([found[np.linalg.norm(found - m, axis=1).argmin()] - m for m in middles])
+    near = off[np.linalg.norm(off, axis=1) < 1]
+    assert len(near) > 16 and np.abs(np.median(near, axis=0)).max() < 0.04
+
+
 def test_a_blank_picture_has_no_points_and_matches_nothing():
     blank, seen = detect(picture(marks(count=0)), 500), detect(picture(marks()), 500)
     assert len(blank.at) == 0

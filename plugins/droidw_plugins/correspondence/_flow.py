@@ -45,6 +45,7 @@ from droidw_plugins.correspondence._flow_types import (
     FlowFrame,
     Found,
     Kept,
+    KeptInRounds,
     Track,
     set_out_from,
     taken_out_alike,
@@ -92,8 +93,8 @@ class FlowCorrespondence:
         self._full: Kept[_Pair, Array] = Kept(_FULL_FIELDS)
         self._grid: Kept[_Pair, Array] = Kept(_GRID_FIELDS)
         self._seeds = SeedBook(options.seeds)
-        self._pairs: Kept[tuple[Hashable, ...], tuple[Edge, Edge]] = Kept(_PAIRS)
-        self._plain: Kept[tuple[Hashable, ...], tuple[Found, Found]] = Kept(_PAIRS)
+        self._pairs: KeptInRounds[tuple[Hashable, ...], tuple[Edge, Edge]] = KeptInRounds(_PAIRS)
+        self._plain: KeptInRounds[tuple[Hashable, ...], tuple[Found, Found]] = KeptInRounds(_PAIRS)
 
     def encode(self, frame: Frame, grid: Grid) -> FlowFrame:
         """Grey image, less what the user's mask covers, and its structure at the cells."""
@@ -366,6 +367,11 @@ class FlowCorrespondence:
         confidence = information(a, across, along, self.options, normal)
         target = ((a.centres + found.moved - self.offset) / self.stride).astype(np.float32)
         return Edge(target, confidence, found.started)
+
+    def settle(self) -> None:
+        """End a round of searches: pairs of long ago are given up."""
+        self._pairs.settle()
+        self._plain.settle()
 
     def map(self, jobs: list[Callable[[], Any]]) -> list[Any]:
         """Run jobs on the pool, results in order."""

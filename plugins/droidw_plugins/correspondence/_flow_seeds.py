@@ -127,7 +127,13 @@ def detect(grey: Picture, most: int) -> Points:
         grey: [H,W]. most: points that are kept, those of most contrast.
     """
     larger = cv2.resize(grey, None, fx=_LARGER, fy=_LARGER, interpolation=cv2.INTER_CUBIC)
-    finder: Any = cv2.SIFT.create(most, contrastThreshold=_CONTRAST, edgeThreshold=_ELONGATED)
+    # without the last of these, points lie a quarter of its pixels to the right and below
+    finder: Any = cv2.SIFT.create(
+        most,
+        contrastThreshold=_CONTRAST,
+        edgeThreshold=_ELONGATED,
+        enable_precise_upscale=True,
+    )
     found, described = finder.detectAndCompute(larger, None)
     if described is None:
         return Points(np.zeros((0, 2), np.float32), np.zeros((0, 128), np.uint8), np.zeros(0, bool))

@@ -104,12 +104,18 @@ class FlowSession:
         coords: Array,
         bridged: dict[int, FlowFrame],
     ) -> None:
-        """One job per unordered pair, since the check needs both directions anyway."""
+        """One job per unordered pair, since the check needs both directions anyway.
+
+        A direction that is not wanted sets out from its prediction too: from nowhere it would end
+        elsewhere, and good matches of the other one would fail the check.
+        """
         pairs: dict[tuple[int, int], dict[bool, int]] = {}
         for row in wanted:
             i, j = request.ii[row], request.jj[row]
             pairs.setdefault((min(i, j), max(i, j)), {})[i < j] = row
 
+        ends = zip(request.ii, request.jj, strict=True)
+        predicted = {end: row for row, end in enumerate(ends)}
         options = self._owner.options
         valid = request.valid.cpu().numpy() if request.informed and wanted else None
 
@@ -118,9 +124,9 @@ class FlowSession:
                 return None
             return coords[row] if valid[row].mean() > 0.5 else None
 
-        def job(key: tuple[int, int], rows: dict[bool, int]) -> Callable[[], Any]:
+        def job(key: tuple[int, int]) -> Callable[[], Any]:
             a, b = request.payload(key[0]), request.payload(key[1])
-            starts = start(rows.get(True)), start(rows.get(False))
+            starts = start(predicted.get(key)), start(predicted.get(key[::-1]))
             without = bridged.get(key[0], a), bridged.get(key[1], b)
             seeded = options.seeds > 0 and (
                 request.doubtful or min(f.held for f in without) < options.seeds_below
@@ -129,7 +135,8 @@ class FlowSession:
                 a, b, *starts, self._fine, bridged=without, seeded=seeded
             )
 
-        measured = self._owner.map([job(key, rows) for key, rows in pairs.items()])
+        measured = self._owner.map([job(key) for key in pairs])
+        self._owner.settle()
         for rows, both in zip(pairs.values(), measured, strict=True):
             for forward, row in rows.items():
                 edge = both[0 if forward else 1]

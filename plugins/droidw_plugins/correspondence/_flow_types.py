@@ -185,8 +185,38 @@ class Kept(Generic[Key, Value]):
         """Keep a value, and give up the oldest where that is one too many."""
         with self._lock:
             self._values[key] = value
-            while len(self._values) > self._most:
-                self._values.popitem(last=False)
+            self._values.move_to_end(key)
+            self._give_up()
+
+    def _give_up(self) -> None:
+        while len(self._values) > self._most:
+            self._values.popitem(last=False)
+
+
+class KeptInRounds(Kept[Key, Value]):
+    """The same where values depend on more than their keys: which are given up shows in results.
+
+    Threads of one round end in any order. So values are given up between rounds alone, and those of
+    one round in the order of their keys.
+    """
+
+    def __init__(self, most: int) -> None:
+        super().__init__(most)
+        self._fresh: set[Key] = set()
+
+    def put(self, key: Key, value: Value) -> None:
+        """Keep a value, however many there are, till the round is over."""
+        with self._lock:
+            self._values[key] = value
+            self._fresh.add(key)
+
+    def settle(self) -> None:
+        """End a round: nothing is put meanwhile."""
+        with self._lock:
+            for key in sorted(self._fresh, key=repr):
+                self._values.move_to_end(key)
+            self._fresh.clear()
+            self._give_up()
 
 
 def held(power: Array) -> npt.NDArray[np.bool_]:
