@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
+import re
 import shutil
 import signal
+import socket
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +26,7 @@ RETRIES = 3
 """How often a cell is started again whose worker was lost."""
 
 _POLL = 0.5
+_REACHED = 10.0  # seconds
 
 
 def require_ray() -> None:
@@ -87,6 +90,7 @@ def _start(init: Callable[..., Any], address: str | None, room: int, place: str 
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     try:
         if address:
+            _reach(address)
             init(address=address, **quiet)
         else:
             init(num_cpus=room, include_dashboard=False, _temp_dir=place, **quiet)
@@ -95,6 +99,13 @@ def _start(init: Callable[..., Any], address: str | None, room: int, place: str 
             f"--executor ray: Ray cannot be started or reached: {error}",
             "check --ray-address, or run the cells as processes: --executor local",
         ) from error
+
+
+def _reach(address: str) -> None:
+    """Raise OSError where nobody answers at host:port, for which Ray waits for minutes."""
+    found = re.fullmatch(r"(?:ray://)?\[?([^\]]+?)\]?:(\d+)", address)
+    if found:
+        socket.create_connection((found[1], int(found[2])), timeout=_REACHED).close()
 
 
 @contextmanager

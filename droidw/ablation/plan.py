@@ -118,7 +118,8 @@ def load_plan(
         config=tuple(_config(name, path, reader) for name in reader.items("config", str, [])),
         base=(str(lines.get("base", reader.file)), reader.mapping("base")),
         sequences=_sequences(reader, data, sequences),
-        seeds=tuple(seeds) or tuple(reader.items("seeds", int, [0])),
+        # each once: the same seed twice would be one folder, and no spread
+        seeds=tuple(dict.fromkeys(seeds or reader.items("seeds", int, [0]))),
         rows=reader.layers("rows"),
         columns=tuple(reader.items("columns", str, list(Plan.columns))),
         measure=reader.record("measure"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import shlex
 import sys
 from pathlib import Path
@@ -85,6 +86,8 @@ def main(args: argparse.Namespace) -> int:
     file, overrides = _split(args.items)
     if args.jobs < 1:
         raise UsageError(f"--jobs counts from 1, and {args.jobs} is less")
+    if args.limit is not None and not 0 < args.limit < math.inf:
+        raise UsageError(f"--limit is a number of seconds above 0, and not {args.limit}")
     if args.ray_address and args.executor != "ray":
         raise UsageError("--ray-address is for --executor ray")
     plan = load_plan(

@@ -73,6 +73,11 @@ _FLAGS = {
 """Flag -> configuration key that it is another spelling of."""
 
 
+def _in_full(source: str) -> str:
+    """A file or folder by its whole path, so that what is kept of a run holds from anywhere."""
+    return str(Path(source).resolve()) if Path(source).exists() else source
+
+
 def main(args: argparse.Namespace) -> int:
     """Run, and say where the files are.
 
@@ -80,7 +85,7 @@ def main(args: argparse.Namespace) -> int:
         DroidwError: as `droidw.run.run`.
     """
     source, overrides = _split(args.items)
-    values = {} if source is None else {"input.source": source}
+    values = {} if source is None else {"input.source": _in_full(source)}
     if args.calib is not None:
         values["camera.calib"] = args.calib
     if args.masks is not None:

@@ -102,9 +102,15 @@ def evaluate(
             raise
         # Nobody asked for the masks beside the footage: the trajectory is worth its figures.
         notes.append(f"masks are not scored: {error.message}")
+    if found is not None and (given := _given_masks(run_dir)):
+        notes.append(
+            f"the run was told what moves (input.masks: {given}): the score of its uncertainty is "
+            "not of what it found by itself"
+        )
     reference = reference or _known_reference(run_dir, source)
     if reference is None and found is not None:
-        return Evaluation(None, masks=found, notes=(f"only masks are scored: {_NO_REFERENCE}",))
+        notes.append(f"only masks are scored: {_NO_REFERENCE}")
+        return Evaluation(None, masks=found, notes=tuple(notes))
     if reference is None:
         raise UsageError(
             f"nothing to compare with: {_NO_REFERENCE}" + "".join(f"; {note}" for note in notes),
@@ -171,6 +177,17 @@ _NO_REFERENCE = (
     "no reference was given, and the run has no truth.tum and does not name a source with a "
     "groundtruth.txt"
 )
+
+
+def _given_masks(run_dir: Path | None) -> str:
+    """The folder of masks that a run was given, or ""."""
+    if run_dir is None:
+        return ""
+    try:
+        config = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
+        return str(config["input"]["masks"] or "")
+    except (OSError, KeyError, TypeError, yaml.YAMLError):
+        return ""
 
 
 def _known_reference(run_dir: Path | None, source: Path | None) -> Path | None:

@@ -66,6 +66,10 @@ def test_layers_from_weak_to_strong(plan, plugins):
     assert [cell.threads for cell in plain] == [1, 1]
 
 
+def test_a_seed_that_is_there_twice_counts_once(plan):
+    assert plan(["full"], seeds=[1, 0, 1]).seeds == (1, 0)
+
+
 def test_what_varies_with_the_seed(plan, plugins):
     found = plan(["full"], vary=["input.skip"], seeds=[0, 5])
     cells, _ = make_cells(found, plugins)

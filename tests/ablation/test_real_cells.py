@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
 from types import SimpleNamespace
 
 import pytest
@@ -14,7 +15,7 @@ from droidw.ablation.on_ray import run_on_ray
 from droidw.ablation.plan import load_plan
 from droidw.ablation.run import Means, run_ablation
 from droidw.cli.main import main
-from droidw.errors import MissingRequirementError
+from droidw.errors import DroidwError, MissingRequirementError
 from droidw.plugin.manager import load_plugins
 
 PLAN = """
@@ -158,6 +159,15 @@ def test_a_task_of_ray_that_fails_says_why(files, tmp_path):
     (_, running), (state, outcome) = told
     assert running is None and state == "failed"
     assert outcome.error.startswith("its task failed: FileNotFoundError")
+
+
+def test_a_cluster_that_does_not_answer(files):
+    with socket.socket() as held:  # bound, and nobody listens
+        held.bind(("127.0.0.1", 0))
+        place = f"127.0.0.1:{held.getsockname()[1]}"
+        with pytest.raises(DroidwError, match="Ray cannot be started or reached") as caught:
+            run_on_ray([], lambda *_: None, 1, address=place)
+    assert "--ray-address" in caught.value.hint
 
 
 def test_without_ray_it_is_said(files, monkeypatch):

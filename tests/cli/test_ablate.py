@@ -84,6 +84,8 @@ def test_what_is_wrong_is_said_before_anything_runs(ablate, tmp_path):
         (("plan.yaml", *data, "--seeds", "a"), 2, "--seeds: 'a' is no list of whole numbers"),
         (("plan.yaml", *data, "--seeds=-1"), 2, "holds a number below 0"),
         (("plan.yaml", *data, "--jobs", "0"), 2, "--jobs counts from 1"),
+        (("plan.yaml", *data, "--limit", "-1"), 2, "--limit is a number of seconds above 0"),
+        (("plan.yaml", *data, "--limit", "nan"), 2, "--limit is a number of seconds above 0"),
         (("plan.yaml", *data, "--ray-address", "auto"), 2, "--ray-address is for --executor ray"),
         (("plan.yaml", *data, "fast"), 2, "'fast' is neither an option nor an override"),
         (("plan.yaml", *data, "camera.fovv=3"), 2, "command line: camera.fovv"),

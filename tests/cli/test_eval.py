@@ -150,6 +150,17 @@ def test_bad_rows_are_left_out_and_told(
     assert any("groundtruth.txt, line 6" in note for note in record["notes"])
 
 
+def test_a_run_that_was_told_what_moves(
+    places: tuple[Path, Path], capsys: pytest.CaptureFixture
+) -> None:
+    run, source = places
+    for masks, told in (("", False), (str(source / "mask"), True)):
+        (run / "config.yaml").write_text(f"input: {{source: '{source}', masks: '{masks}'}}\n")
+        assert run_eval(run, "--ref", source / "groundtruth.txt", "--json") == 0
+        notes = json.loads(capsys.readouterr().out)["notes"]
+        assert any("the run was told what moves" in note for note in notes) == told
+
+
 @pytest.mark.parametrize("named", [True, False], ids=["--masks", "mask/ of the source"])
 def test_masks_alone(places: tuple[Path, Path], named: bool, capsys: pytest.CaptureFixture) -> None:
     run, source = places

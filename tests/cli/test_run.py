@@ -8,7 +8,7 @@ import pytest
 
 from droidw import load_plugins
 from droidw.cli.main import main
-from droidw.cli.run import _split
+from droidw.cli.run import _in_full, _split
 from droidw.errors import UsageError
 
 SMALL = [
@@ -182,6 +182,13 @@ def test_source_and_overrides(tmp_path, monkeypatch):
     assert _split(["take=2.mp4", "a=1"]) == ("take=2.mp4", ["a=1"])
     with pytest.raises(UsageError, match="'b' is neither"):
         _split(["a", "b"])
+
+
+def test_a_source_is_kept_by_its_whole_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "clip.mp4").touch()
+    assert _in_full("clip.mp4") == str(tmp_path / "clip.mp4")
+    assert _in_full("bonn:balloon") == "bonn:balloon" and _in_full("gone") == "gone"
 
 
 def test_without_a_folder_a_new_one_is_made(tmp_path, monkeypatch, capsys):
