@@ -199,6 +199,21 @@ class BackendConfig:
         "brings keyframes nearer",
         ge=2,
     )
+    last_nms: int = opt(
+        1,
+        "`nms` of the passes with `last_tuning`, if `edges_hidden` is reached and this is less",
+        ge=0,
+    )
+    last_factors: int = opt(
+        20, "`factors_per_keyframe` of these passes, if that is reached and this is more", ge=2
+    )
+    edges_hidden: float = opt(
+        0.05,
+        "share of all cells that uncertainty and masks close, from which the last passes have more "
+        "edges: what is hidden in some pairs is seen in others (1: never)",
+        ge=0,
+        le=1,
+    )
     backwards_below: float = opt(
         0.7,
         "agreement of all matches with poses and depths below which keyframes are tracked once "

@@ -88,7 +88,8 @@ class Backend:
                 store.disps.div_(mean)
                 store.T_cw[:, :3].mul_(mean)
             graph = FactorGraph(store.grid.height, store.grid.width, store.device)
-            graph.add(self.edges())
+            more = self._is_last(number, wide) and self._hidden() >= options.edges_hidden
+            graph.add(self.edges(more))
             if len(graph) < 3:
                 return 0
             session = self.optimiser.parts.correspondence.session("global")
@@ -123,6 +124,10 @@ class Backend:
         """Whether the kernel of a pass follows the median residual, if `global_solver` says so."""
         return number > int(wide) or number == len(self.config.backend.passes) - 1
 
+    def _is_last(self, number: int, wide: bool) -> bool:
+        """Whether it is one of the very last passes: the path has come to rest by all matches."""
+        return number > int(wide) + 1
+
     def _solver(self, number: int, wide: bool) -> SolverConfig:
         """The solver of one pass; its kernel narrows from pass to pass.
 
@@ -138,7 +143,7 @@ class Backend:
             return self._wider(options.wide_start)
         if not self._is_narrow(number, wide):
             return replace(solver, cauchy_tuning=0.0, depth_damping=1.0)
-        if number > int(wide) + 1:
+        if self._is_last(number, wide):
             if options.last_planes > 0 and self._hidden() >= options.planes_hidden:
                 solver = replace(solver, planes=options.last_planes)
             if options.last_tuning > 0:
@@ -187,9 +192,19 @@ class Backend:
         cauchy = times * solver.cauchy
         return replace(solver, cauchy=cauchy, cauchy_tuning=0.0, depth_damping=1.0)
 
-    def edges(self) -> list[tuple[int, int]]:
-        """Directed edges between keyframes, chosen by how far they are apart now."""
+    def edges(self, more: bool = False) -> list[tuple[int, int]]:
+        """Directed edges between keyframes, chosen by how far they are apart now.
+
+        What is hidden in some pairs of pictures is seen in others: where much is, more pairs tell
+        more. Before a path has come to rest they hold it where it is.
+
+        Args:
+            more: as `backend.last_nms` and `backend.last_factors` say.
+        """
         store, options = self.optimiser.store, self.config.backend
+        nms, factors = options.nms, options.factors_per_keyframe
+        if more:
+            nms, factors = min(nms, options.last_nms), max(factors, options.last_factors)
         count = len(store)
         ii, jj = torch.tril_indices(count, count, -1)
         near = []
@@ -209,7 +224,7 @@ class Backend:
         distance[ii.numpy(), jj.numpy()] = torch.cat(near).double().numpy()
         steps = spans(store["movable"], store["unmasked"], self.config.motion_filter)
         # where keyframes are near to one another, more of them are as far apart as elsewhere
-        most = int(options.factors_per_keyframe * (1 / steps).sum())
+        most = int(factors * (1 / steps).sum())
         if options.nms_shape == "diamond":
             return frontend_edges(
                 distance,
@@ -217,7 +232,7 @@ class Backend:
                 0,
                 (),
                 radius=options.radius,
-                nms=options.nms,
+                nms=nms,
                 threshold=options.threshold,
                 max_factors=most,
                 spans=steps,
@@ -225,7 +240,7 @@ class Backend:
         return backend_edges(
             distance,
             radius=options.radius,
-            nms=options.nms,
+            nms=nms,
             threshold=options.threshold,
             max_factors=most,
             spans=steps,

@@ -176,6 +176,37 @@ def test_walls_are_held_to_be_flat_in_the_last_passes(broken, monkeypatch, rows,
     assert heard == expected
 
 
+@pytest.mark.parametrize(
+    ("rows", "options", "more"),
+    [
+        (1, {}, [False, False, False, True, True]),
+        (1, {"edges_hidden": 0.2}, [False] * 5),
+        (0, {}, [False] * 5),
+        (0, {"edges_hidden": 0.0}, [False, False, False, True, True]),
+        (1, {"passes": [1, 1]}, [False] * 2),
+    ],
+)
+def test_the_last_passes_have_more_edges_where_much_is_hidden(
+    broken, monkeypatch, rows, options, more
+):
+    backend, _ = broken(**{"passes": [1] * 5, **options})
+    store = backend.optimiser.store
+    store["unmasked"][: len(store), :rows] = 0.0
+    few, many = backend.edges(), backend.edges(more=True)
+    assert set(few) < set(many)
+    heard = []
+    monkeypatch.setattr(
+        backend.optimiser, "update", lambda graph, *rest, **more: heard.append(len(graph))
+    )
+    run(backend)
+    assert heard == [len(many if wanted else few) for wanted in more]
+
+
+def test_options_of_the_last_passes_leave_out_no_edge(broken):
+    backend, _ = broken(nms=0, factors_per_keyframe=40, last_nms=3, last_factors=4)
+    assert backend.edges(more=True) == backend.edges()
+
+
 def test_the_last_passes_go_by_the_matches_that_fit_best(broken, arc):
     def turned_off(T_cw, right):
         found, true = (mul(T[1:], inv(T[:-1])) for T in (T_cw, right))
