@@ -66,6 +66,10 @@ def markdown(table: Table, command: str = "") -> str:
     if failures:
         lines += ["", "## Without a result", ""]
         lines += [f"- `{cell.name}`: {why}" for cell, why in failures]
+    remarks = table.remarks()
+    if remarks:
+        lines += ["", "## To be known", ""]
+        lines += [f"- `{name}`: {sentence}" for name, sentence in remarks]
     return "\n".join(lines) + "\n"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
@@ -37,7 +38,9 @@ def make_page(table: Table, command: str = "") -> str:
     for column in table.columns:
         parts.append(f"<h2>{escape(table.title(column))}</h2>{_table(table, column)}")
         parts.append(_bars(table, column))
-    parts.append(_failures(table))
+    failures = [(cell.name, why) for cell, why in table.failures()]
+    parts.append(_listed("Without a result", failures))
+    parts.append(_listed("To be known", table.remarks()))
     parts += [_sequence(table, sequence) for sequence in plan.sequences]
     parts.append(_cells(table))
     body = "\n".join(part for part in parts if part)
@@ -124,12 +127,12 @@ def _sequence(table: Table, sequence: str) -> str:
     return f"<h2>{escape(sequence)}</h2><p>First seed of each row.</p>{errors}{views}"
 
 
-def _failures(table: Table) -> str:
+def _listed(title: str, sentences: Sequence[tuple[str, str]]) -> str:
     items = [
-        f"<li><code>{escape(cell.name)}</code>: <span class='why'>{escape(why)}</span></li>"
-        for cell, why in table.failures()
+        f"<li><code>{escape(name)}</code>: <span class='why'>{escape(sentence)}</span></li>"
+        for name, sentence in sentences
     ]
-    return f"<h2>Without a result</h2><ul>{''.join(items)}</ul>" if items else ""
+    return f"<h2>{title}</h2><ul>{''.join(items)}</ul>" if items else ""
 
 
 def _cells(table: Table) -> str:

@@ -135,6 +135,20 @@ class Table:
                 found.append((cell, why))
         return found
 
+    def remarks(self) -> list[tuple[str, str]]:
+        """What is to be known of figures: (column or cell, a sentence), in this order.
+
+        Columns that no cell has, and what runs with a result were warned of and measuring noted.
+        """
+        shown = {column.key for column in self.columns}
+        found = [(key, "no cell has this figure") for key in self.plan.columns if key not in shown]
+        for cell, outcome in self.cells:
+            if outcome is None or outcome.error:
+                continue
+            said = [*outcome.facts.get("warnings", ()), *outcome.facts.get("notes", ())]
+            found += [(cell.name, str(sentence)) for sentence in dict.fromkeys(said)]
+        return found
+
     def grid(self, column: Column) -> list[list[str]]:
         """Rows of text: a head, then each row with every sequence, the mean and the ratio."""
         sequences = self.having(column.key)

@@ -139,6 +139,10 @@ def _show(table: Table, folder: Path, args: argparse.Namespace) -> None:
     if failures:
         print("without a result:")
         print(text([(cell.name, why) for cell, why in failures], indent=2) + "\n")
+    remarks = table.remarks()
+    if remarks:
+        print("to be known:")
+        print(text(remarks, indent=2) + "\n")
     width = max(len(name) for name in FILES)
     for name, meaning in FILES.items():
         print(f"  {folder}/{name:<{width}}  {meaning}")

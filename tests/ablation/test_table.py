@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import pytest
@@ -98,6 +99,21 @@ def test_markdown():
     assert "| worse | 4.0000 ± 0.0000 | 2.0000 ± 0.0000 (2 of 3) | 3.0000 | 1.00 |" in lines
     assert "| lost | failed | 1.0000 ± 0.0000 (2 of 3) | - | - |" in lines
     assert "- `worse/b/seed-1`: no | luck" in lines and "- `lost/b/seed-2`: not run" in lines
+
+
+def test_what_is_to_be_known_of_figures():
+    assert FULL.remarks() == [] and "To be known" not in markdown(FULL) + make_page(FULL)
+    known = table({("full", "a"): [1.0, "lost"]}, (0, 1), ("ate_rmse", "masks.auk"))
+    cell, outcome = known.cells[0]
+    facts = {"warnings": ["it <blinks>"], "notes": ["few masks", "it <blinks>"]}
+    known = replace(known, cells=((cell, replace(outcome, facts=facts)), *known.cells[1:]))
+    assert known.remarks() == [
+        ("masks.auk", "no cell has this figure"),
+        ("full/a/seed-0", "it <blinks>"),
+        ("full/a/seed-0", "few masks"),
+    ]
+    assert "## To be known\n\n- `masks.auk`: no cell" in markdown(known)
+    assert "it &lt;blinks&gt;" in make_page(known)
 
 
 def test_csv_has_every_cell_and_every_figure():
