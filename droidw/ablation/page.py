@@ -39,7 +39,7 @@ def make_page(table: Table, command: str = "") -> str:
         parts.append(f"<h2>{escape(table.title(column))}</h2>{_table(table, column)}")
         parts.append(_bars(table, column))
     failures = [(cell.name, why) for cell, why in table.failures()]
-    parts.append(_listed("Without a result", failures))
+    parts.append(_listed("Without a result", failures, "why"))
     parts.append(_listed("To be known", table.remarks()))
     parts += [_sequence(table, sequence) for sequence in plan.sequences]
     parts.append(_cells(table))
@@ -127,9 +127,9 @@ def _sequence(table: Table, sequence: str) -> str:
     return f"<h2>{escape(sequence)}</h2><p>First seed of each row.</p>{errors}{views}"
 
 
-def _listed(title: str, sentences: Sequence[tuple[str, str]]) -> str:
+def _listed(title: str, sentences: Sequence[tuple[str, str]], style: str = "") -> str:
     items = [
-        f"<li><code>{escape(name)}</code>: <span class='why'>{escape(sentence)}</span></li>"
+        f"<li><code>{escape(name)}</code>: <span class='{style}'>{escape(sentence)}</span></li>"
         for name, sentence in sentences
     ]
     return f"<h2>{title}</h2><ul>{''.join(items)}</ul>" if items else ""

@@ -21,6 +21,7 @@ Array = npt.NDArray[np.float64]
 _PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f3c8d", "#666666")
 """Told apart by colour-blind readers too."""
 
+_MARGIN = 76.0  # left of a chart: its label, and numbers as long as -0.0004
 _GREY, _INK = "#dddddd", "#333333"
 _FONT = "font-family='system-ui,sans-serif' font-size='12'"
 _MOST = 1500  # points of a line
@@ -72,7 +73,7 @@ def line_chart(
 ) -> str:
     """Lines over a common x axis; y starts at 0 if nothing is below."""
     width, height = size
-    box = (62.0, 34.0, width - 14.0, height - 44.0)
+    box = (_MARGIN, 34.0, width - 14.0, height - 44.0)
     x_low, x_high = _span([line.x for line in lines])
     y_low, y_high = _span([line.y for line in lines])
     y_low = min(0.0, y_low)
@@ -99,7 +100,7 @@ def path_panels(
     body = [_text(14, 20, title, weight=True)]
     for number, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
         left = number * panel
-        box = (left + 58.0, 34.0, left + float(panel), height - 44.0)
+        box = (left + _MARGIN, 34.0, left + float(panel), height - 44.0)
         square = min(box[2] - box[0], box[3] - box[1])
         box = (box[0], box[1], box[0] + square, box[1] + square)
         frame = _Frame(
@@ -119,7 +120,7 @@ def bar_chart(
 ) -> str:
     """Groups of bars with their spread as a whisker and single values as dots."""
     height = 320
-    box = (62.0, 34.0 + 18.0 * math.ceil(len(bars) / 6), width - 14.0, height - 34.0)
+    box = (_MARGIN, 34.0 + 18.0 * math.ceil(len(bars) / 6), width - 14.0, height - 34.0)
     tops = [v + (s or 0.0) for b in bars for v, s in _with_spread(b) if v is not None]
     tops += [single for b in bars for one in b.singles for single in one]
     frame = _Frame(box, (0.0, float(len(groups))), (0.0, max(tops, default=1.0) * 1.08 or 1.0))
@@ -200,7 +201,7 @@ class _Frame:
         parts.append(f"<path d='M{left:.1f} {top:.1f}V{bottom:.1f}H{right:.1f}' "
                      f"fill='none' stroke='{_INK}'/>")  # fmt: skip
         parts.append(_text((left + right) / 2, bottom + 34, x_label, "middle"))
-        x, y = left - 46, (top + bottom) / 2
+        x, y = left - _MARGIN + 14, (top + bottom) / 2
         parts.append(
             f"<text x='{x:.1f}' y='{y:.1f}' text-anchor='middle' "
             f"transform='rotate(-90 {x:.1f} {y:.1f})'>{escape(y_label)}</text>"
