@@ -181,13 +181,17 @@ _NO_REFERENCE = (
 
 def _given_masks(run_dir: Path | None) -> str:
     """The folder of masks that a run was given, or ""."""
-    if run_dir is None:
-        return ""
+    return "" if run_dir is None else str(_input_of(run_dir).get("masks") or "")
+
+
+def _input_of(run_dir: Path) -> dict[str, Any]:
+    """`input` of the configuration that a run folder keeps; empty where there is none."""
     try:
-        config = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
-        return str(config["input"]["masks"] or "")
-    except (OSError, KeyError, TypeError, yaml.YAMLError):
-        return ""
+        settings = yaml.safe_load((run_dir / "config.yaml").read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        return {}
+    chosen = settings.get("input") if isinstance(settings, dict) else None
+    return chosen if isinstance(chosen, dict) else {}
 
 
 def _known_reference(run_dir: Path | None, source: Path | None) -> Path | None:
@@ -258,15 +262,7 @@ def source_of(run_dir: Path) -> Path | None:
             content = {}
         if isinstance(content, dict):
             named.append(str(content.get("source", "")))
-    config = run_dir / "config.yaml"
-    if config.is_file():
-        try:
-            settings = yaml.safe_load(config.read_text(encoding="utf-8"))
-        except (OSError, ValueError, yaml.YAMLError):
-            settings = {}
-        chosen = settings.get("input") if isinstance(settings, dict) else None
-        if isinstance(chosen, dict):
-            named.append(str(chosen.get("source", "")))
+    named.append(str(_input_of(run_dir).get("source", "")))
     for text in named:
         for candidate in (text, text.partition(":")[2]):
             if candidate and Path(candidate).is_dir():
