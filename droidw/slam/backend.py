@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from droidw.graph.proximity import backend_edges, frontend_edges
 from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 from droidw.slam.motion_filter import spans
+from droidw.slam.passes import all_passes
 from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
@@ -24,13 +25,12 @@ if TYPE_CHECKING:
     from droidw.config.schema import DroidwConfig, SolverConfig
     from droidw.interfaces.correspondence import EdgeSession
     from droidw.slam.optimise import Optimiser
+    from droidw.slam.passes import Kernel, Pass
 
 __all__ = ["Backend"]
 
 # Pairs whose distance is computed at once; bounds memory, not the result.
 _CHUNK = 2048
-# By how much less steady motion counts from pass to pass.
-_FADES = 3.0
 
 
 class Backend:
@@ -40,7 +40,9 @@ class Backend:
         focal_known: the focal length is a calibration, not a guess.
         motion_prior: how much steady motion counts in the first pass, as `backend.motion_prior`.
         learn: uncertainty learns anew after the first pass, as `backend.learn`.
+        passes: to make; None: those of the configuration.
     Attributes:
+        passes: those that `run` makes.
         focal: what the search for a better focal length found, None without one.
         agreement: share of what was measured last that agrees with poses and depths; NaN before.
     """
@@ -52,9 +54,12 @@ class Backend:
         focal_known: bool = True,
         motion_prior: float = 0.0,
         learn: bool = False,
+        passes: Sequence[Pass] | None = None,
     ) -> None:
         self.optimiser = optimiser
         self.config = config
+        wide = config.global_solver.cauchy > 0
+        self.passes = all_passes(config.backend, wide) if passes is None else tuple(passes)
         self.focal_known = focal_known
         self.motion_prior = motion_prior
         self.learn = learn
@@ -62,7 +67,7 @@ class Backend:
         self.agreement = float("nan")
 
     def run(self, tell: Callable[[int, int], None]) -> int:
-        """All passes of the configuration.
+        """Make the passes.
 
         Args:
             tell: called with (update steps done, update steps in all).
@@ -73,12 +78,11 @@ class Backend:
         if len(store) < 3:
             return 0
         row = self.config.schedule["global"]
-        total = sum(options.passes)
+        total = sum(part.updates for part in self.passes)
         done = edges = 0
-        wide, anew = self._begins_wide(), False
-        for number, updates in enumerate(options.passes):
-            solver, prior = self._solver(number, wide), self._prior(number)
-            learns = self.learn and (number > 0 or number == len(options.passes) - 1)
+        anew = False
+        for number, part in enumerate(self.passes):
+            learns = self.learn and part.learns
             if learns and not anew:
                 self.optimiser.begin_anew()
                 anew = True
@@ -87,25 +91,30 @@ class Backend:
                 mean = store.disps.mean()
                 store.disps.div_(mean)
                 store.T_cw[:, :3].mul_(mean)
+            solver = self._solver(part.kernel)
             graph = FactorGraph(store.grid.height, store.grid.width, store.device)
-            more = self._is_last(number, wide) and self._hidden() >= options.edges_hidden
+            more = part.kernel == "narrowest" and self._hidden() >= options.edges_hidden
             graph.add(self.edges(more))
             if len(graph) < 3:
                 return 0
             session = self.optimiser.parts.correspondence.session("global")
             shown = store.disps
-            for _ in range(updates):
+            for _ in range(part.updates):
                 if "droid-w" in self.config.compat:
                     # as published: enlarged before the bundle adjustment of the same step
                     shown = store.disps.clone()
                 self.optimiser.update(
-                    graph, session, phase, solver, first_free=1, motion_prior=prior
+                    graph,
+                    session,
+                    phase,
+                    solver,
+                    first_free=1,
+                    motion_prior=part.steady * self.motion_prior,
                 )
                 done += 1
                 tell(done, total)
             edges = len(graph)
-            refine = self.config.camera.refine_focal and number == int(wide)
-            if refine and len(store) >= MIN_KEYFRAMES:
+            if part.refines and self.config.camera.refine_focal and len(store) >= MIN_KEYFRAMES:
                 self.focal = refine_focal(
                     self.optimiser,
                     graph,
@@ -114,22 +123,14 @@ class Backend:
                     self.config.camera,
                     self.focal_known,
                 )
-            if number == len(options.passes) - 1:
+            if number == len(self.passes) - 1:
                 self._upsample(session, shown)
                 gates = self.optimiser.gates()
                 self.agreement = explained_share(store, graph, graph.select(), gates)
         return edges
 
-    def _is_narrow(self, number: int, wide: bool) -> bool:
-        """Whether the kernel of a pass follows the median residual, if `global_solver` says so."""
-        return number > int(wide) or number == len(self.config.backend.passes) - 1
-
-    def _is_last(self, number: int, wide: bool) -> bool:
-        """Whether it is one of the very last passes: the path has come to rest by all matches."""
-        return number > int(wide) + 1
-
-    def _solver(self, number: int, wide: bool) -> SolverConfig:
-        """The solver of one pass; its kernel narrows from pass to pass.
+    def _solver(self, kernel: Kernel) -> SolverConfig:
+        """The solver of a pass with this kernel.
 
         One that follows the median residual is too narrow to mend what has broken off, as long as
         most of the path is sound. So the last passes alone have it. And they alone let depths go
@@ -139,11 +140,11 @@ class Backend:
         there for what is hidden; where little is, they know less than matches do.
         """
         solver, options = self.config.global_solver, self.config.backend
-        if wide and number == 0:
+        if kernel == "wide":
             return self._wider(options.wide_start)
-        if not self._is_narrow(number, wide):
+        if kernel == "usual":
             return replace(solver, cauchy_tuning=0.0, depth_damping=1.0)
-        if self._is_last(number, wide):
+        if kernel == "narrowest":
             if options.last_planes > 0 and self._hidden() >= options.planes_hidden:
                 solver = replace(solver, planes=options.last_planes)
             if options.last_tuning > 0:
@@ -154,21 +155,6 @@ class Backend:
     def _hidden(self) -> float:
         """Share of all cells that are closed, by uncertainty or a mask."""
         return float((self.optimiser.gates() < CLOSED).float().mean())
-
-    def _prior(self, number: int) -> float:
-        """How much steady motion counts in one pass; measurements have the last word."""
-        last = number == len(self.config.backend.passes) - 1
-        return 0.0 if last else self.motion_prior / _FADES**number
-
-    def _begins_wide(self) -> bool:
-        """Whether the first pass has a wider kernel than those after it.
-
-        Where the path has broken, the matches across the break are all that can mend it, and they
-        are the very ones that a narrow kernel gives up.
-        """
-        options = self.config.backend
-        kernel = self.config.global_solver.cauchy > 0 and options.wide_start > 1
-        return kernel and len(options.passes) > 1
 
     def _upsample(self, session: EdgeSession, disps: Tensor) -> None:
         """Keep full-size maps where correspondence can make them."""

@@ -8,7 +8,7 @@ camera that sets off fast or a first look at a bare wall, often is not in the ot
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -19,6 +19,7 @@ from droidw.events import Dispatcher, Progress
 from droidw.slam.backend import Backend
 from droidw.slam.frontend import Frontend
 from droidw.slam.optimise import Optimiser
+from droidw.slam.passes import all_passes, last_passes
 from droidw.slam.path import Path
 from droidw.slam.restart import contradicted, credit, matched_points, set_out
 from droidw.slam.splice import lead, pieces, spliced, support
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
     from droidw.config.schema import DroidwConfig
     from droidw.slam.diagnosis import Diagnosis
+    from droidw.slam.passes import Pass
     from droidw.solve.epipolar import PointMatches
 
 __all__ = ["doubted", "track_backwards"]
@@ -35,9 +37,6 @@ __all__ = ["doubted", "track_backwards"]
 _log = logging.getLogger(__name__)
 
 Tell = Callable[[int, int], None]
-
-# Global passes for a path of which little has changed since it was adjusted.
-_FEW_PASSES = 2
 
 
 def doubted(
@@ -115,11 +114,14 @@ class _SecondLook:
         self._stopped = stopped
         self._done = 0
         options = config.backend
+        # It has been through the wide kernel, which lets weak links drift.
+        self._passes = all_passes(options, wide=False)
+        self._few = last_passes(options, wide=config.global_solver.cauchy > 0)
         self._finishes = options.relearn or options.motion_prior > 0
-        steps = (1 + options.turns * int(self._finishes)) * sum(options.passes)
+        steps = (1 + options.turns * int(self._finishes)) * _updates(self._passes)
         few = 1 + int(options.splice)
         few += 2 * min(options.restarts, options.turns) * int(self._finishes)
-        steps += few * sum(options.passes[-_FEW_PASSES:])
+        steps += few * _updates(self._few)
         self._total = len(optimiser.store) + steps
 
     def set_out_anew(self) -> None:
@@ -127,7 +129,7 @@ class _SecondLook:
         matches = matched_points(self.optimiser)
         if matches is None:
             return
-        whole, self._total = self._total, 2 * sum(self.config.backend.passes[-_FEW_PASSES:])
+        whole, self._total = self._total, 2 * _updates(self._few)
         self._give_say(matches)
         self._restart(matches)
         self.optimiser.points = None
@@ -137,7 +139,7 @@ class _SecondLook:
         """All of the way back, with `kept` up to date whenever it is left."""
         options = self.config.backend
         # Measured as the way back will be, or neither could be held against the other.
-        there = self._adjusted(self.kept, options.passes[-_FEW_PASSES:], learn=False)
+        there = self._adjusted(self.kept, self._few, learn=False)
         before = self._done
         back = track_backwards(
             self.optimiser,
@@ -163,7 +165,7 @@ class _SecondLook:
 
     def _splice(self, other: Path) -> None:
         """Take the pieces of another path in which it agrees more."""
-        optimiser, passes = self.optimiser, self.config.backend.passes
+        optimiser = self.optimiser
         known = support(optimiser, self.kept)
         ahead = lead(support(optimiser, other), known)
         taken = pieces(ahead)
@@ -171,7 +173,7 @@ class _SecondLook:
             return
         inside = torch.tensor(taken)
         joined = spliced(self.kept, other, taken, optimiser.gates())
-        found = self._adjusted(joined, passes[-_FEW_PASSES:], learn=False)
+        found = self._adjusted(joined, self._few, learn=False)
         # Global adjustment may have left what was taken for it.
         gained = float(lead(support(optimiser, found), known)[inside].sum())
         holds = gained > 0
@@ -194,7 +196,7 @@ class _SecondLook:
         Returns:
             Whether it does.
         """
-        optimiser, passes = self.optimiser, self.config.backend.passes[-_FEW_PASSES:]
+        optimiser = self.optimiser
         gates = optimiser.gates()
         motions = contradicted(self.kept, matches, optimiser.store.intrinsics, gates)
         if not motions:
@@ -205,7 +207,7 @@ class _SecondLook:
             return credit((self.kept, found), (known, support(optimiser, found)), matches)
 
         other = set_out(optimiser, self.config, self.kept, motions)
-        found = self._adjusted(other, passes, learn=False)
+        found = self._adjusted(other, self._few, learn=False)
         taken = pieces(gain(found))
         _log.info(
             "points contradict %d of %d motions between keyframes, %d are set out anew",
@@ -216,7 +218,7 @@ class _SecondLook:
         if not any(taken):
             return False
         joined = spliced(self.kept, found, taken, gates)
-        found = self._adjusted(joined, passes, learn=False)
+        found = self._adjusted(joined, self._few, learn=False)
         leads = float(gain(found)[torch.tensor(taken)].sum()) > 0
         if leads:
             self.kept = found
@@ -251,12 +253,12 @@ class _SecondLook:
             if turn % 3 == 2 and options.beyond > 0 and not restarted:
                 start = self.kept.beyond(last, options.beyond)
             found = self._adjusted(
-                start, options.passes, learn=options.relearn, motion_prior=options.motion_prior
+                start, self._passes, learn=options.relearn, motion_prior=options.motion_prior
             )
             last, self.kept = self.kept, replace(found, agreement=agreement)
 
     def _adjusted(
-        self, path: Path, passes: list[int], learn: bool, motion_prior: float = 0.0
+        self, path: Path, passes: Sequence[Pass], learn: bool, motion_prior: float = 0.0
     ) -> Path:
         """A path after passes of global adjustment."""
         path.write_to(self.optimiser.store)
@@ -265,11 +267,9 @@ class _SecondLook:
         config = replace(
             self.config,
             schedule={**self.config.schedule, "global": row},
-            # It has been through the wide kernel, which lets weak links drift.
-            backend=replace(self.config.backend, passes=passes, wide_start=1.0),
             camera=replace(self.config.camera, refine_focal=False),
         )
-        backend = Backend(self.optimiser, config, motion_prior=motion_prior)
+        backend = Backend(self.optimiser, config, motion_prior=motion_prior, passes=passes)
         backend.run(lambda done, _: self._tell(before + done, self._total))
         return Path.of(self.optimiser.store, backend.agreement)
 
@@ -308,7 +308,8 @@ def track_backwards(
     config = replace(config, schedule=schedule, camera=camera)
     store = known.blank()
     frontend = Frontend(optimiser.beside(store), config)
-    steps = sum(config.backend.passes)
+    backend = Backend(frontend.optimiser, config)
+    steps = _updates(backend.passes)
 
     def told(done: int) -> None:
         if stopped():
@@ -331,12 +332,15 @@ def track_backwards(
             elif done >= first:
                 frontend.grow(forced=True)
         frontend.release()
-        backend = Backend(frontend.optimiser, config)
         backend.run(lambda done, total: told(count + done))
     except _Stopped:
         return None
     optimiser.add_reports(frontend.optimiser)
     return Path.of(store, backend.agreement).turned(known.T_cw[0])
+
+
+def _updates(passes: Sequence[Pass]) -> int:
+    return sum(part.updates for part in passes)
 
 
 class _Stopped(Exception):

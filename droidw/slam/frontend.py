@@ -114,7 +114,8 @@ class Frontend:
         weigh = self._phase("init_blind").weigh
         cost = trials.settled_cost(weigh)
         store.write(*mirrored(*found))
-        self._updates("init_blind", first_free=1, informed=False)
+        # What uncertainty learned could not be taken back, and the first phase has taught it.
+        self._updates("init_blind", first_free=1, informed=False, learn=False)
         if not trials.settled_cost(weigh) < cost:
             store.write(*found)
 
@@ -155,8 +156,11 @@ class Frontend:
         row = self.config.schedule[name]
         return replace(row, weigh=True) if name == "init_blind" and self.optimiser.begun else row
 
-    def _updates(self, phase: str, first_free: int, informed: bool = True) -> None:
+    def _updates(
+        self, phase: str, first_free: int, informed: bool = True, learn: bool = True
+    ) -> None:
         row = self._phase(phase)
+        row = row if learn else replace(row, learn=False)
         for _ in range(row.updates):
             self.optimiser.update(
                 self.graph,

@@ -93,8 +93,10 @@ class MotionFilter:
         self._options = options
         self._reference: Encoded | None = None
         self._threshold = options.threshold
-        # Frames are counted from here; and the candidate of which the window has yet to decide.
-        self._last_index = 0
+        # Frames judged, and how many were when the last keyframe was; candidates by the index of
+        # their frame, of which the window may have yet to decide; and the newest of them, if so.
+        self._judged = self._last = 0
+        self._candidates: dict[int, int] = {}
         self._open: int | None = None
         self._closed = not ahead
         self._window = threading.Condition()
@@ -102,12 +104,13 @@ class MotionFilter:
 
     def judge(self, current: Encoded) -> Verdict:
         """Whether `current` becomes a keyframe; if so it is the reference from now on."""
+        self._judged += 1
         if self._reference is None:
             self._accept(current, forced=True)
             return Verdict(keep=True, forced=False, motion=None)
         motion = self._correspondence.motion(self._reference.payload, current.payload)
         options = self._options
-        forced = options.force_every > 0 and self._gap(current.frame.index) >= options.force_every
+        forced = options.force_every > 0 and self._gap() >= options.force_every
         keep = motion.flow > self._threshold
         if motion.matched < options.min_matched and motion.matched >= options.lost_below:
             keep = True
@@ -143,8 +146,9 @@ class MotionFilter:
     def settled(self, index: int, kept: bool) -> None:
         """Whether candidate `index` has become a keyframe for good: frames are counted from it."""
         with self._window:
+            judged = self._candidates.pop(index, 0)
             if kept:
-                self._last_index = max(self._last_index, index)
+                self._last = max(self._last, judged)
             if self._open == index:
                 self._open = None
             self._window.notify_all()
@@ -155,16 +159,16 @@ class MotionFilter:
             self._closed = True
             self._window.notify_all()
 
-    def _gap(self, index: int) -> int:
+    def _gap(self) -> int:
         """Frames since the last keyframe that the window has kept, where that matters."""
         with self._window:
             while (
                 self._open is not None
                 and not self._closed
-                and index - self._last_index >= self._options.force_every
+                and self._judged - self._last >= self._options.force_every
             ):
                 self._window.wait()
-            return index - self._last_index
+            return self._judged - self._last
 
     def _accept(self, current: Encoded, forced: bool) -> None:
         self._reference = current
@@ -172,9 +176,10 @@ class MotionFilter:
         self._lost = 0
         with self._window:
             if forced:  # the window may not drop it
-                self._last_index, self._open = current.frame.index, None
+                self._last, self._open = self._judged, None
             else:
                 self._open = current.frame.index
+                self._candidates[self._open] = self._judged
 
 
 def nearness(cells: Tensor, options: MotionFilterConfig) -> npt.NDArray[np.float64]:

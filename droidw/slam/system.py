@@ -186,7 +186,7 @@ class SlamSystem:
         """What can move in a keyframe, where that is asked; the filter is told what is hidden."""
         above, frame = self.config.motion_filter.movable_above, current.frame
         aside = self._aside and above > 0
-        movable = self._maps.movable(frame) if self._renews or aside else None
+        movable = self._maps.movable(frame) if self.optimiser.begins else None
         cells = movable > above if aside and movable is not None else None
         masked = None if frame.mask is None else self._maps.unmasked(frame) < CLOSED
         self._filter.set_aside(current, cells, masked)
@@ -247,8 +247,6 @@ class SlamSystem:
             info.whole = current.plain.context, self._maps.unmasked(current.plain.frame)
         known = {"unmasked": self._maps.unmasked(frame)}
         movable = current.movable
-        if movable is None and self.optimiser.begins and not self.frontend.initialised:
-            movable = self._maps.movable(frame)
         if movable is not None:
             known["movable"] = movable
         number = store.append(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from droidw.geometry.camera import Grid
@@ -58,3 +59,22 @@ def test_what_it_finds_under_a_mask_is_not_taken_for_the_whole_picture(operator,
     assert not np.array_equal(whole[0].target, cut[0].target)
     again = operator().both_ways(*plain, None, None, bridged=tuple(plain))
     assert np.array_equal(whole[0].target, again[0].target)
+
+
+@pytest.mark.parametrize("step", [4, 8])
+def test_frames_that_are_not_read_are_not_missing(operator, frame, step):
+    """With `--stride` a picture is searched from the motion so far, too."""
+
+    def found(step, gap=0):
+        part = operator()
+        grid = Grid.of(H, W, part.stride, part.offset)
+        indices = [0, step, 2 * step + gap, 3 * step + gap]
+        seen = [part.encode(frame(index, moving(k)), grid) for k, index in enumerate(indices)]
+        motions = [part.motion(seen[0], one) for one in seen[1:]]
+        return motions, part.one_way(seen[0], seen[3]).target
+
+    motions, target = found(step)
+    expected, same = found(1)
+    assert motions == expected and np.array_equal(target, same)
+    # more of them in a row than may be missing: the last of the searches starts afresh
+    assert found(step, gap=6 * step)[0] != expected

@@ -148,7 +148,7 @@ class Settled:
             inverse depths are off 1, in logarithms.
     Attributes:
         learned: for each global adjustment after the way back, whether uncertainty was to learn.
-        passes: of each of these, all without the wide kernel.
+        passes: updates and kernel of each of these, none with the wide one.
         priors: how much steady motion counted in each of these.
         points: matches of points that counted in each of these, and how much.
         begun: mean logarithm of the inverse depths from which each of these set out.
@@ -186,12 +186,13 @@ class Settled:
         return between
 
     def adjust(self, backend, tell):
-        assert backend.config.backend.wide_start == 1.0
+        made = [(part.updates, part.kernel) for part in backend.passes]
         if not self.asked:
             assert not backend.config.schedule["global"].learn
+            self.there = made
             backend.agreement = self.more["again"]
             return
-        self.passes.append(backend.config.backend.passes)
+        self.passes.append(made)
         self.learned.append(backend.config.schedule["global"].learn)
         self.priors.append(backend.motion_prior)
         self.points.append(backend.optimiser.points)
@@ -240,11 +241,13 @@ def test_the_way_back_is_kept_where_more_agrees_and_learned_from(optimiser, conf
 
 @pytest.mark.parametrize(("found", "share"), [(0.6, 1 - 4 / 13), (0.4, 4 / 13)])
 def test_pieces_of_the_way_that_agrees_less_are_taken(optimiser, config, monkeypatch, found, share):
-    config.backend.passes = [1, 2, 3]
+    config.backend.passes = [1, 2, 3, 4]
     made = Settled(optimiser, config, monkeypatch, found, piece=range(3, 7))
     assert (made.kept.agreement, made.kept.backwards) == (0.7, pytest.approx(share))
     assert made.learned == [False, True, True]
-    assert made.passes == [[2, 3], [1, 2, 3], [1, 2, 3]]
+    few = [(2, "usual"), (3, "narrow"), (4, "narrowest")]
+    again = [(1, "usual"), (2, "narrow"), (3, "narrowest"), (4, "narrowest")]
+    assert (made.there, made.passes) == (few, [few, again, again])
     # what was taken for its matches is not to be drawn to a steady path before it is weighed
     assert made.priors == [0.0, config.backend.motion_prior, config.backend.motion_prior]
 

@@ -25,22 +25,25 @@ class Table:
         return Motion(9.0 if current in MOVED else 0.0, 1.0)
 
 
-def judged(judge):
+def judged(judge, stride=1):
+    """Judges every frame there is of a source of which every `stride`-th is read."""
     blank = torch.zeros(0)
     for k in range(COUNT):
-        encoded = Encoded(Frame(k, k / 30, blank, blank), k)
+        encoded = Encoded(Frame(stride * k, stride * k / 30, blank, blank), k)
         yield k, judge.judge(encoded)
 
 
-def verdicts(ahead, drops):
+def verdicts(ahead, drops, stride=1):
     """(frame, forced) of all candidates; the window drops those in `drops` that it may."""
     judge = MotionFilter(Table(), MotionFilterConfig(force_every=5), ahead)
     found = []
     with ThreadPoolExecutor(1) as pool:
-        for k, verdict in look_ahead(judged(judge), 32, pool if ahead else None, judge.close):
+        for k, verdict in look_ahead(
+            judged(judge, stride), 32, pool if ahead else None, judge.close
+        ):
             if verdict.keep:
                 found.append((k, verdict.forced))
-                judge.settled(k, verdict.forced or k not in drops)
+                judge.settled(stride * k, verdict.forced or k not in drops)
     return found
 
 
@@ -50,6 +53,13 @@ def test_what_runs_ahead_says_the_same(drops):
     assert any(forced for _, forced in expected) and not all(forced for _, forced in expected)
     for _ in range(5):
         assert verdicts(True, drops) == expected
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_frames_are_counted_that_are_tracked(ahead):
+    """Not those between them that `--stride` leaves out."""
+    drops = {3, 10, 17, 31}
+    assert verdicts(ahead, drops, stride=4) == verdicts(ahead, drops)
 
 
 def test_it_goes_on_until_the_window_matters():

@@ -106,8 +106,8 @@ LEARNED = ("features=cnn", "uncertainty=affine-softplus", "uncertainty.options.m
 
 @pytest.mark.parametrize("threaded", [False, True])
 @pytest.mark.parametrize(("keep", "above"), [(0.9, 0.0), (0.0, 0.1), (0.9, 0.1), (0.0, 0.0)])
-def test_what_can_move_is_asked_of_the_keyframes_that_need_it(system, keep, above, threaded):
-    """Of all where the model renews its start or motion is told without it, else of the first."""
+def test_what_can_move_is_asked_of_all_keyframes(system, keep, above, threaded):
+    """Of all: the model may renew its start, motion is told without it, or all are learned anew."""
     settings = (f"uncertainty.options.movable_keep={keep}", f"motion_filter.movable_above={above}")
     slam, frames = system(threaded, (*LEARNED, *settings))
     features, model, op = slam.parts.features, slam.parts.uncertainty, slam.parts.correspondence
@@ -120,7 +120,9 @@ def test_what_can_move_is_asked_of_the_keyframes_that_need_it(system, keep, abov
     count = len(slam.store)
     assert slam.frontend.initialised and count > 4
     assert len(aside) == (len(asked) if above else 0)
-    assert len(asked) >= count if keep or above else len(asked) == 4
+    assert len(asked) >= count
+    for number, found in enumerate(slam.store["movable"]):
+        assert any(torch.equal(found, one) for one in asked), number
     assert bool(renewed) is (keep > 0)
     for number, found in renewed:
         assert number >= 4 and any(found is one for one in asked)
@@ -148,3 +150,21 @@ def test_lines_hold_a_rendered_room(system, rendered):
         assert float(torch.rad2deg(apart[:, 3:].norm(dim=1)).median()) < 0.5
     assert np.array_equal(paths[30, False], paths[30, True])
     assert not np.array_equal(paths[30, False], paths[0, False])
+
+
+def test_the_mirrored_start_teaches_uncertainty_nothing(system, monkeypatch):
+    """It is a trial: what is learned could not be taken back with it."""
+    slam, frames = system(False, LEARNED)
+    model, taught, tried = slam.parts.uncertainty, [], []
+    update, trial = model.update, slam.frontend._try_mirrored
+    monkeypatch.setattr(model, "update", lambda view: taught.append(0) or update(view))
+
+    def counted():
+        before = len(taught)
+        trial()
+        tried.append((before, len(taught)))
+
+    monkeypatch.setattr(slam.frontend, "_try_mirrored", counted)
+    slam.track(iter(frames))
+    ((before, after),) = tried
+    assert before > 0 and after == before

@@ -135,23 +135,27 @@ class Track:
         reference, current: frames between which `flow` holds.
         flow: [H,W,2] pixels, reference to current.
         velocity: [H,W,2] pixels per frame.
+        step: by how much the index grows from one frame to the next, if none is missing.
     """
 
     reference: int
     current: int
     flow: Array
     velocity: Array
+    step: int
 
     @classmethod
     def after(
         cls, before: Track | None, reference: FlowFrame, current: FlowFrame, flow: Array
     ) -> Track:
         """The track one measurement later."""
+        step = current.index - (reference.index if before is None else before.current)
+        step = max(step if before is None else min(step, before.step), 1)
         if before is not None and before.reference == reference.index:
             velocity = (flow - before.flow) / np.float32(max(current.index - before.current, 1))
         else:
             velocity = flow / np.float32(max(current.index - reference.index, 1))
-        return cls(reference.index, current.index, flow, velocity)
+        return cls(reference.index, current.index, flow, velocity, step)
 
     def ahead(self, reference: FlowFrame, current: FlowFrame) -> Array | None:
         """The flow from `reference` to a later frame if all goes on; None if that is unknown.
@@ -159,7 +163,7 @@ class Track:
         The velocity belongs to pixels of an older frame: good enough for a start.
         """
         gap = current.index - self.current
-        if not 0 < gap <= _LONGEST_GAP:
+        if not 0 < gap <= _LONGEST_GAP * self.step:
             return None
         going_on: Array = self.velocity * np.float32(gap)
         if reference.index == self.reference:
