@@ -15,6 +15,15 @@ DEFAULT_MAX_DIFF = 0.02
 """Largest difference of two matched stamps in seconds, unless one asks for another."""
 
 
+# By how much the usual step between stamps may differ from that of another unit, as one side may
+# have keyframes alone.
+_COARSER = 30.0
+# Numbers of frames are told from seconds by how many frames there are, as a share of them, and by
+# how much longer that would take.
+_AS_MANY, _MUCH_LONGER = 0.2, 3.0
+_INDICES = "these look like frame indices"
+
+
 @dataclass(frozen=True)
 class Association:
     """Matched stamps of an estimate and a reference.
@@ -68,7 +77,8 @@ def associate(
         minimum: fewer pairs than this are refused.
     Raises:
         UsageError: if `max_diff` or `offset` is no sensible number.
-        InputError: if fewer than `minimum` pairs are found; the message says why it looks so.
+        InputError: if fewer than `minimum` pairs are found, or those that are found mean nothing,
+            as frames of one side are numbered; the message says why it looks so.
     """
     if not (np.isfinite(max_diff) and max_diff >= 0):
         raise UsageError(
@@ -85,6 +95,9 @@ def associate(
     pairs_est, pairs_ref = pairs_est[order], pairs_ref[order]
     if len(pairs_est) < minimum:
         raise _refusal(times_est, times_ref, len(pairs_est), minimum, max_diff)
+    if counted := _counted(times_est, times_ref):
+        said = f"{len(pairs_est)} pairs within {max_diff:g} s are there by chance alone"
+        raise InputError(f"the time stamps do not match, {said}: {_INDICES}", _seconds(counted))
     return Association(
         est=pairs_est,
         ref=pairs_ref,
@@ -161,25 +174,20 @@ def _guess(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64]) -> tuple[
     """What the stamps look like, and what to do about it."""
     if not len(est) or not len(ref):
         return "", "give a trajectory with at least one pose a line: t tx ty tz qx qy qz qw"
-    for mine, other, word in ((est, ref, "estimate"), (ref, est, "reference")):
-        if _like_indices(mine) and not _like_indices(other):
-            return (
-                "these look like frame indices",
-                f"write the {word} with the seconds of its frames (the first column of rgb.txt)",
-            )
-    ratio = np.median(est) / np.median(ref) if np.median(ref) else 0.0
+    if counted := _counted(est, ref):
+        return _INDICES, _seconds(counted)
     spacing = _spacing(est) / _spacing(ref)
     for factor, unit in ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")):
-        for value, steps, word in (
-            (ratio, spacing, "estimate"),
-            (1 / ratio if ratio else 0.0, 1 / spacing, "reference"),
-        ):
-            # In another unit the steps between stamps are larger too; a later clock has the same.
-            if np.abs(value - factor) < 0.5 * factor and steps > factor**0.5:
+        # By the steps between stamps: a clock that starts elsewhere, or a part, has the same.
+        for steps, word in ((spacing, "estimate"), (1 / spacing, "reference")):
+            if factor / _COARSER < steps < factor * _COARSER:
                 return (
                     f"the {word} looks like {unit}",
                     f"divide the first column of the {word} by {factor:.0e}",
                 )
+    for mine, other, word in ((est, ref, "estimate"), (ref, est, "reference")):
+        if _like_indices(mine) and not _like_indices(other):
+            return _INDICES, _seconds(word)
     gap = max(est.min() - ref.max(), ref.min() - est.max())
     if gap > 0:
         shift = ref.min() - est.min()
@@ -200,6 +208,25 @@ def _spacing(times: npt.NDArray[np.float64]) -> float:
     steps = np.diff(np.sort(times))
     steps = steps[steps > 0]
     return float(np.median(steps)) if len(steps) else 1.0
+
+
+def _counted(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64]) -> str:
+    """Which side has numbers of the frames that the other has seconds of; empty: neither.
+
+    Its last stamp is how many stamps the other has, and not how long that takes.
+    """
+    for mine, other, word in ((est, ref, "estimate"), (ref, est, "reference")):
+        if not _like_indices(mine) or _like_indices(other) or len(other) < 2:
+            continue
+        last = float(mine.max()) + 1
+        as_many = abs(last - len(other)) < _AS_MANY * len(other)
+        if as_many and last > _MUCH_LONGER * float(np.ptp(other)):
+            return word
+    return ""
+
+
+def _seconds(word: str) -> str:
+    return f"write the {word} with the seconds of its frames (the first column of rgb.txt)"
 
 
 def _like_indices(times: npt.NDArray[np.float64]) -> bool:

@@ -32,6 +32,9 @@ _STRETCH = 0.05
 """Largest relative difference of two ratios of sides that counts as the same shape: cropping to
 whole cells takes off a few pixels."""
 
+_NO_BLACK = 31
+"""Colours of labels are brighter than this in one channel."""
+
 
 def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
     """Masks by the index of their frame.
@@ -180,17 +183,22 @@ def check_shape(
 
 
 def read_mask(path: Path) -> npt.NDArray[np.bool_]:
-    """A mask [H,W] bool from a picture: True where it is brighter than half.
+    """A mask [H,W] bool from a picture: True where it moves.
 
-    A picture with values 0 and 1 alone counts as 0 and 255.
+    In colours, as where each object has one, that is everything but black; in grey levels what is
+    brighter than half, or everything but black if nothing is: numbers of objects.
 
     Raises:
         InputError: if the file is no picture.
     """
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if picture is None:
         raise InputError(f"{path}: cannot be read as a picture")
-    return np.asarray(picture > (0 if picture.max(initial=0) == 1 else 127))
+    brightest = np.asarray(picture).max(axis=2)
+    coloured = bool((picture.min(axis=2) != brightest).any())
+    # the black of a JPEG in colours is not clean
+    least = _NO_BLACK if coloured else 127
+    return np.asarray(brightest > (0 if brightest.max(initial=0) <= least else least))
 
 
 def read_uncertainty(path: Path) -> npt.NDArray[np.uint16]:

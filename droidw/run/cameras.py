@@ -78,6 +78,8 @@ def _scaled(camera: Camera, width: int, height: int, source: str) -> Camera:
 def open_masks(config: InputConfig, source: FrameSource) -> UserMasks | None:
     """The masks that the configuration names, or None.
 
+    Args:
+        source: with all its pictures, whatever `max_frames` says.
     Raises:
         InputError: the folder is not there or holds no masks.
     """
@@ -85,8 +87,6 @@ def open_masks(config: InputConfig, source: FrameSource) -> UserMasks | None:
         return None
     if source.length is None:
         return UserMasks(Path(config.masks), 0, None)
-    # A selection hides how many pictures there are, but for a range.
+    # A stride hides how many pictures there are, but for a range.
     least = config.skip + (source.length - 1) * config.stride + 1
-    return UserMasks(
-        Path(config.masks), least, None if config.max_frames else least + config.stride - 1
-    )
+    return UserMasks(Path(config.masks), least, least + config.stride - 1)

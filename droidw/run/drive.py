@@ -39,6 +39,7 @@ from droidw.slam.timing import Stopwatch
 if TYPE_CHECKING:
     from droidw.config.resolve import ResolvedConfig
     from droidw.interfaces.datasets import FrameSource
+    from droidw.io.masks import UserMasks
     from droidw.plugin.manager import Plugins
     from droidw.slam.frame import Frame, RawFrame
 
@@ -100,6 +101,7 @@ class _Run:
         self.config, self.device, self.stop, self.note = resolved.config, device, stop, note
         self.started = time.perf_counter()
         self.sweeps = self.kept = 1
+        self.masks: UserMasks | None = None
         self.clock = Stopwatch()
         self.context = BuildContext(
             device=device,
@@ -147,7 +149,9 @@ class _Run:
         )
         if guessed:
             self.events.warn(f"camera: {self.said}")
-        self.masks = open_masks(self.config.input, source)
+        if self.config.input.masks:
+            whole = open_source(self.resolved, self.plugins, self.context, whole=True)
+            self.masks = open_masks(self.config.input, whole)
         self.context = replace(self.context, camera=camera)
         able = self.resolved.parts["correspondence"][0].capabilities
         threads = "threads" in able or (self.device.type == "cuda" and "gpu-threads" in able)

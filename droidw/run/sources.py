@@ -22,16 +22,20 @@ __all__ = ["open_source"]
 _log = logging.getLogger("droidw.run.drive")
 
 
-def open_source(resolved: ResolvedConfig, plugins: Plugins, context: BuildContext) -> FrameSource:
+def open_source(
+    resolved: ResolvedConfig, plugins: Plugins, context: BuildContext, *, whole: bool = False
+) -> FrameSource:
     """The footage of a run, by the reader that is named, or by the first that recognises it.
 
+    Args:
+        whole: whatever `input.max_frames` says, to its end.
     Raises:
         InputError: no source is given, nothing recognises it, or it cannot be used.
     """
     given = resolved.config.input
     if not given.source:
         raise InputError("no source is given", "type: droidw run SOURCE")
-    selection = Selection(given.stride, given.skip, given.max_frames)
+    selection = Selection(given.stride, given.skip, 0 if whole else given.max_frames)
     if "reader" in resolved.parts:
         component, options = resolved.parts["reader"]
         chosen: DatasetReader = component.factory(options, context)

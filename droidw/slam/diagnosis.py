@@ -11,7 +11,7 @@ from torch import Tensor
 from droidw.geometry.projective import NEAR, pixel_grid, relative_pose, reproject
 from droidw.graph.store import KeyframeStore
 
-__all__ = ["Diagnosis", "diagnose", "parallax"]
+__all__ = ["Diagnosis", "diagnose", "parallax", "unusable"]
 
 
 @dataclass(frozen=True)
@@ -187,3 +187,13 @@ def _median(values: Tensor, weight: Tensor) -> float:
     order = values.flatten().argsort()
     sums = weight.flatten()[order].double().cumsum(0)
     return float(values.flatten()[order[int(torch.searchsorted(sums, sums[-1] / 2))]])
+
+
+def unusable(store: KeyframeStore) -> dict[str, int]:
+    """How many cells of all keyframes have an uncertainty that is none: by the name of a report.
+
+    The gate closes what is not finite, and takes what is negative for what is sure.
+    """
+    u = store["uncertainty"]
+    count = int((~(u.isfinite() & (u >= 0))).sum())
+    return {"unusable": count} if count else {}

@@ -21,7 +21,7 @@ from droidw.slam.backend import Backend
 from droidw.slam.backwards import doubted
 from droidw.slam.cell_maps import CellMaps
 from droidw.slam.cloud import consistent_depth, static_cloud
-from droidw.slam.diagnosis import diagnose, parallax
+from droidw.slam.diagnosis import diagnose, parallax, unusable
 from droidw.slam.filler import Filler
 from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
@@ -313,7 +313,7 @@ class SlamSystem:
             focal=self.focal,
             last_index=self.last_index,
             metric=self.parts.depth.metric,
-            reports=dict(self.optimiser.reports),
+            reports={**self.optimiser.reports, **unusable(self.store)},
         )
 
     def _reveal(self) -> None:

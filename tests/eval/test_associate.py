@@ -76,6 +76,34 @@ def test_other_units_are_recognised(factor: float, unit: str) -> None:
         associate(seconds, seconds * factor)
 
 
+@pytest.mark.parametrize("factor", [1e9, 1e6, 1e3])
+def test_a_clock_of_another_unit_may_start_anywhere_and_last_less_long(factor: float) -> None:
+    seconds = np.linspace(1311868163.0, 1311868250.0, 2400)
+    part = np.round((seconds[200:900:4] - seconds[200]) * factor)
+    unit = {1e9: "nano", 1e6: "micro", 1e3: "milli"}[factor]
+    with pytest.raises(InputError, match=f"the estimate looks like {unit}seconds"):
+        associate(part, seconds)
+    with pytest.raises(InputError, match=f"the reference looks like {unit}seconds"):
+        associate(seconds, part)
+
+
+@pytest.mark.parametrize("step", [1, 7])
+def test_frame_indices_are_no_seconds_where_some_of_them_are_as_large(step: int) -> None:
+    """Frames 0, 1, ... 9 are as many seconds into 300 frames of ten seconds."""
+    seconds, indices = np.arange(300) / 30, np.arange(0.0, 300.0, step)
+    for est, ref, word in ((indices, seconds, "estimate"), (seconds, indices, "reference")):
+        with pytest.raises(InputError, match=r"by chance alone: .* frame indices") as caught:
+            associate(est, ref)
+        assert f"write the {word} with the seconds" in caught.value.hint
+
+
+def test_a_clock_that_ticks_once_a_second_is_one() -> None:
+    """Truth once a second beside frames of as many seconds, or of the first of them."""
+    for seconds in (300, 20):
+        found = associate(np.arange(30 * seconds) / 30, np.arange(300.0))
+        assert len(found) == seconds
+
+
 def test_another_time_and_a_coarse_clock_are_told_apart() -> None:
     with pytest.raises(InputError, match=r"they lie 41 s apart") as caught:
         associate(np.linspace(50.5, 60.25, 30), np.linspace(0.25, 9.5, 30))

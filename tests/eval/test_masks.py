@@ -215,9 +215,20 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         score_folder(root / "uncertainty", root / "mask")
 
 
-def test_masks_of_zeros_and_ones(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "m.png"), np.array([[0, 1]], np.uint8))
-    assert read_mask(tmp_path / "m.png").tolist() == [[False, True]]
+@pytest.mark.parametrize(
+    ("picture", "moves"),
+    [
+        ([0, 1, 0, 1], [0, 1, 0, 1]),
+        ([0, 1, 2, 3], [0, 1, 1, 1]),  # numbers of objects
+        ([0, 100, 128, 255], [0, 0, 1, 1]),  # soft edges
+        ([0, 0, 0, 0], [0, 0, 0, 0]),
+        ([[0, 0, 0], [0, 0, 128], [0, 128, 0], [64, 0, 0]], [0, 1, 1, 1]),  # of DAVIS
+        ([[0, 0, 0], [3, 0, 1], [0, 128, 0], [255, 255, 255]], [0, 0, 1, 1]),  # no clean black
+    ],
+)
+def test_what_moves_in_masks_of_all_kinds(tmp_path: Path, picture, moves) -> None:
+    cv2.imwrite(str(tmp_path / "m.png"), np.array([picture], np.uint8))
+    assert read_mask(tmp_path / "m.png").tolist() == [[bool(one) for one in moves]]
 
 
 def test_the_first_maps_may_be_left_out(tmp_path: Path) -> None:

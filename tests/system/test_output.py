@@ -175,6 +175,34 @@ def test_a_part_that_breaks_while_tracking_keeps_what_was_tracked(go, footage, p
     assert len(ran.poses) == ran.manifest["frames"]
 
 
+NONSENSE = """
+import droidw
+from droidw.interfaces.uncertainty import UncertaintyReport
+
+class Odd:
+    fields = ()
+    def append(self, view, index):
+        view.uncertainty[index] = 0.0
+        view.uncertainty[index, 0, 0] = {value}
+    def update(self, view):
+        return UncertaintyReport()
+
+@droidw.hookimpl
+def droidw_uncertainty_models():
+    yield droidw.Component("odd", "one cell in each keyframe is no uncertainty", lambda o, c: Odd())
+"""
+
+
+@pytest.mark.parametrize("value", ["float('nan')", "float('inf')", "-3.0"])
+def test_uncertainty_that_is_none_is_told_of(go, footage, plugin, value):
+    ran = go(footage().folder, "--plugin", plugin(NONSENSE.format(value=value)), "uncertainty=odd")
+    assert ran.code == 0, ran.err
+    assert len(ran.poses) == 26
+    count = ran.manifest["keyframes"]
+    told = f"{count} cells were left an uncertainty that is negative"
+    assert told in ran.warnings and told in ran.err
+
+
 def test_a_refused_input_leaves_no_folder_in_the_way(tmp_path):
     from droidw.cli.main import main
 

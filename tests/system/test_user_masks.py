@@ -73,10 +73,11 @@ def test_masks_that_do_not_fit(go, postered, tmp_path):
     clip, masks, _ = postered
     for k, path in enumerate(sorted(masks.iterdir())):
         path.rename(masks / f"m{k}.png") if k > 1 else path.unlink()
-    ran = go(clip.folder, "--masks", masks)
-    assert ran.code == 3
-    assert "its 24 masks cannot be laid on 26 pictures" in ran.err
-    assert not ran.folder.exists()
+    for more in ((), ("--max-frames", "8")):
+        ran = go(clip.folder, "--masks", masks, *more)
+        assert ran.code == 3
+        assert "its 24 masks cannot be laid on 26 pictures" in ran.err
+        assert not ran.folder.exists()
     other = tmp_path / "other"
     other.mkdir()
     for k in range(26):
