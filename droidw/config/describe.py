@@ -11,6 +11,7 @@ from typing import Any, Literal, Union
 
 import yaml
 
+from droidw.config.inert import INERT
 from droidw.config.schema import DroidwConfig
 from droidw.plugin.registry import KINDS
 
@@ -60,7 +61,7 @@ def rows(cls: type, prefix: str = "", instance: Any = None) -> Iterator[Row]:
                 type_text(hints[entry.name]),
                 _flow(value),
                 limits_text(entry.metadata),
-                str(entry.metadata.get("help", "")),
+                f"no effect: {INERT[key]}" if key in INERT else entry.metadata.get("help", ""),
             )
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 
 from droidw.config.check import check_keys, check_ranges, typed
+from droidw.config.inert import check_inert
 from droidw.config.load import LISTED, LoadedConfig, Source, load_config, packaged_configs
 from droidw.config.schema import DroidwConfig
 from droidw.errors import ConfigError, DroidwError, MissingRequirementError, PluginError
@@ -275,6 +276,7 @@ def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
                 (f"did you mean 'schedule.{near}'?   " if near else "")
                 + f"phases: {', '.join(phases)}",
             )
+    check_inert(config, loaded)
     if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", config.device):
         raise ConfigError(
             f"{loaded.at('device')}: '{config.device}' is not a device",

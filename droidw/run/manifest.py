@@ -110,8 +110,8 @@ REPORTS = {
     "empty": "{count} bundle adjustment steps had nothing to move",
     "dropped": "{count} measurements that were not finite were left out",
     "uncertainty": "{count} updates of the uncertainty model were not finite",
-    "unusable": "{count} cells were left an uncertainty that is negative (taken for 0) or not finite "
-    "(left out): the uncertainty model is at fault",
+    "unusable": "{count} cells were left an uncertainty that is negative (taken for 0) or not "
+    "finite (left out): the uncertainty model is at fault",
 }
 """What the optimiser counts -> the sentence for the user."""
 

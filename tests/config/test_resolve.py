@@ -92,6 +92,12 @@ PHASES = ", ".join(DroidwConfig().schedule)
         ("schedule.windw.updates=3",
          "schedule.windw: there is no such phase\n  did you mean 'schedule.window'?   "
          f"phases: {PHASES}"),
+        ("schedule.global.updates=3",
+         "schedule.global.updates: this key changes nothing\n  how many there are is set by "
+         "backend.passes; leave it out"),
+        ("filler_solver.guard=true",
+         "filler_solver.guard: this key changes nothing\n  each frame between keyframes is "
+         "adjusted by itself; leave it out"),
         ("schedule.window.updates=-1", "schedule.window.updates: -1 is out of range\n"
                                        "  valid: >= 0"),
         ("schedule.window=3", "schedule.window: 3 is not valid here\n  expected a section with "
