@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from droidw.ablation.plan import Layer, Measuring, Plan
+from droidw.ablation.plan import Footage, Layer, Measuring, Plan
 from droidw.config.load import load_config, override_layers
 from droidw.config.resolve import ResolvedConfig, choose_preset, resolve
 from droidw.errors import DroidwError, InputError, MissingRequirementError, PluginError
@@ -45,6 +45,7 @@ class Cell:
         config: the resolved configuration as YAML.
         missing: why it cannot run on this machine, or "".
         threads: of torch and of workers. gpus: how many it wants.
+        beside: what its result depends on besides, as text.
     """
 
     row: str
@@ -54,6 +55,7 @@ class Cell:
     missing: str = ""
     threads: int = 1
     gpus: float = 0
+    beside: str = ""
 
     @property
     def name(self) -> str:
@@ -62,8 +64,9 @@ class Cell:
 
     @property
     def digest(self) -> str:
-        """What its result depends on: the configuration without comments, as a hash."""
+        """What its result depends on, as a hash; comments in the configuration do not count."""
         lines = [line for line in self.config.splitlines() if not line.startswith("#")]
+        lines += [self.beside] if self.beside else []
         return hashlib.sha256("\n".join(lines).encode("utf-8")).hexdigest()
 
 
@@ -89,13 +92,22 @@ class Outcome:
 
 
 def make_cells(
-    plan: Plan, plugins: Plugins, overrides: Sequence[str] = (), preset: str | None = None
+    plan: Plan,
+    plugins: Plugins,
+    overrides: Sequence[str] = (),
+    preset: str | None = None,
+    *,
+    plugin_files: Sequence[str] = (),
+    data: Path | None = None,
 ) -> tuple[list[Cell], str]:
     """Resolve every cell, so that a mistake in the last row shows before the first one runs.
 
     From weak to strong: preset, `config` files, `base`, the sequence, overrides, the row, the seed
     and what varies with it.
 
+    Args:
+        plugin_files, data: as of `prepare`. Where a file changes, or the folder in which a dataset
+            lies, finished cells run again.
     Returns:
         Cells, row by row, and why a preset was chosen (or "").
     Raises:
@@ -109,7 +121,9 @@ def make_cells(
         chosen, note = choose_preset(plugins)
     _check_sources(plan)
     said = override_layers(overrides)
-    problems: list[DroidwError] = []
+    files = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in plugin_files]
+    first = next(iter(plan.rows), "")
+    problems: dict[str, DroidwError] = {}
     known: dict[str, Cell] = {}
     cells: list[Cell] = []
     for row, row_layer in plan.rows.items():
@@ -117,32 +131,49 @@ def make_cells(
             # Resolving takes a while, and sequences and seeds often differ in values alone.
             # But for what their dataset says of them.
             named = footage.source if ":" in footage.source else ""
+            there = [str(_folder(data))] if named and data is not None else []
+            beside = "\n".join([*files, *there])
             same = json.dumps([row, footage.layer[1], footage.vary, named], default=str)
             if same not in known:
-                source = {"seed": plan.seeds[0], "input": {"source": _place(footage.source)}}
-                varied = override_layers([f"{key}={plan.seeds[0]}" for key in footage.vary])
+                # Every row has the same seeds: what the first one takes of them, all do.
+                seeds = plan.seeds if row == first and footage.vary else plan.seeds[:1]
                 layers = (_QUICK, plan.base, footage.layer, *said, row_layer)
-                loaded = load_config(
-                    plan.config, chosen, (), None, (*layers, ("ablation", source), *varied)
-                )
-                try:
-                    known[same] = _cell(row, sequence, resolve(loaded, plugins), plan)
-                except (MissingRequirementError, PluginError) as error:
-                    problems.append(error)
-                    text = yaml.safe_dump(loaded.data, sort_keys=False)
-                    known[same] = Cell(row, sequence, 0, text, missing=error.message)
+                for seed in reversed(seeds):
+                    varied = _varied(plan, footage, seed)
+                    loaded = load_config(plan.config, chosen, (), None, (*layers, *varied))
+                    try:
+                        known[same] = _cell(row, sequence, resolve(loaded, plugins), plan)
+                    except (MissingRequirementError, PluginError) as error:
+                        text = yaml.safe_dump(loaded.data, sort_keys=False)
+                        known[same] = Cell(row, sequence, 0, text, missing=error.message)
+                        problems[same] = error
             for seed in plan.seeds:
                 values = {"seed": seed, "input.source": _place(footage.source)}
                 values |= dict.fromkeys(footage.vary, seed)
                 config = _with(known[same].config, values)
-                cells.append(replace(known[same], sequence=sequence, seed=seed, config=config))
+                cell = replace(known[same], sequence=sequence, seed=seed, config=config)
+                cells.append(replace(cell, beside=beside))
     if problems and len(problems) == len(known):
-        raise problems[0]
+        raise next(iter(problems.values()))
     return cells, note
+
+
+def _varied(plan: Plan, footage: Footage, seed: int) -> Iterator[Layer]:
+    """Layers of one seed, and of what varies with it."""
+    yield "ablation", {"seed": seed, "input": {"source": _place(footage.source)}}
+    for key in footage.vary:
+        value: Any = seed
+        for name in reversed(key.split(".")):
+            value = {name: value}
+        yield f"{plan.file}: vary", value
 
 
 def _place(source: str) -> str:
     return source if ":" in source else str(Path(source).resolve())
+
+
+def _folder(data: Path) -> Path:
+    return data.expanduser().resolve()
 
 
 def _with(text: str, values: Mapping[str, Any]) -> str:
@@ -215,7 +246,7 @@ def prepare(
         "digest": cell.digest,
         "threads": cell.threads,
         "plugins": [str(Path(file).resolve()) for file in plugin_files],
-        "data": None if data is None else str(data.expanduser().resolve()),
+        "data": None if data is None else str(_folder(data)),
         "folder": str(Path.cwd()),
         "measure": asdict(measure),
     }

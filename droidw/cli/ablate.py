@@ -97,7 +97,10 @@ def main(args: argparse.Namespace) -> int:
         _names(args.rows),
         _numbers(args.seeds),
     )
-    cells, note = make_cells(plan, plugins_from(args), overrides, args.preset)
+    data = Path(args.data) if args.data else None
+    cells, note = make_cells(
+        plan, plugins_from(args), overrides, args.preset, plugin_files=args.plugin, data=data
+    )
     folder = Path(args.output) if args.output else Path("runs/ablations") / Path(file).stem
     means = Means(
         args.executor,
@@ -105,7 +108,7 @@ def main(args: argparse.Namespace) -> int:
         args.limit,
         args.ray_address,
         tuple(args.plugin),
-        Path(args.data) if args.data else None,
+        data,
         args.again,
     )
     command = shlex.join(["droidw", "ablate", *_told(args, file, overrides)])

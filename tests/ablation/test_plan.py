@@ -77,6 +77,44 @@ def test_what_varies_with_the_seed(plan, plugins):
     assert [config(c)["seed"] for c in cells] == [0, 5, 0, 5]
 
 
+@pytest.mark.parametrize(
+    ("vary", "seeds", "said"),
+    [
+        ("input.skp", [0], "plan.yaml: vary: input.skp: there is no such key"),
+        ("input.skip", [0, -1], "plan.yaml: vary: input.skip: -1 is out of range"),
+    ],
+)
+def test_what_cannot_vary_is_refused_with_the_file(plan, plugins, vary, seeds, said):
+    """With the first row, whatever seed it is that does not do."""
+    with pytest.raises(ConfigError) as caught:
+        make_cells(plan({"full": {}, "other": {}}, vary=[vary], seeds=seeds), plugins)
+    assert said in str(caught.value)
+
+
+def test_a_cell_depends_on_plugin_files_and_where_datasets_lie(plan, plugins, tmp_path):
+    file = tmp_path / "part.py"
+    file.write_text("# nothing yet\n")
+    found = plan(["full"])
+
+    def digests(**more):
+        return [cell.digest for cell in make_cells(found, plugins, **more)[0]]
+
+    plain = digests()
+    with_plugin = digests(plugin_files=[str(file)])
+    assert not set(plain) & set(with_plugin)
+    file.write_text("# something else\n")
+    assert not set(with_plugin) & set(digests(plugin_files=[str(file)]))
+    # Where folders of pictures lie is in the configuration already.
+    assert digests(data=tmp_path / "elsewhere") == plain
+    dataset = tmp_path / "p.yaml"
+    dataset.write_text(
+        "preset: paper\nsequences: {a: {source: 'bonn:balloon'}}\n"
+        "rows: {full: {features: none, depth: none, uncertainty: none, correspondence: flow}}\n"
+    )
+    found = load_plan(str(dataset))
+    assert len({*digests(), *digests(data=tmp_path), *digests(data=tmp_path / "elsewhere")}) == 3
+
+
 def test_sequences_with_settings_and_sources(tmp_path, plugins):
     (tmp_path / "footage" / "a").mkdir(parents=True)
     file = tmp_path / "p.yaml"
