@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["HELP", "add_arguments", "main"]
 
 HELP = "run an ablation, rows x sequences x seeds, and make its table"
+USAGE = "%(prog)s ABLATION [options] [key=value ...]"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

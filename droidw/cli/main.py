@@ -81,7 +81,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def build_parser(verb: str, module: ModuleType) -> argparse.ArgumentParser:
     """The parser of one verb, as `droidw VERB -h` shows it."""
     parser = argparse.ArgumentParser(
-        prog=f"droidw {verb}", description=module.HELP[:1].upper() + module.HELP[1:] + "."
+        prog=f"droidw {verb}",
+        usage=getattr(module, "USAGE", None),
+        description=module.HELP[:1].upper() + module.HELP[1:] + ".",
     )
     module.add_arguments(parser)
     _add_verbosity(parser)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["HELP", "add_arguments", "execute", "main"]
 
 HELP = "track a video or a folder of pictures and write the run folder"
+USAGE = "%(prog)s SOURCE [options] [key=value ...]"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,7 @@ import pytest
 from droidw.eval.metrics import Delta, score
 from droidw.eval.plots import write_plots
 from droidw.eval.summary import Evaluation
-from droidw.eval.svg import Bars, Line, bar_chart, line_chart, path_panels
+from droidw.eval.svg import Bars, Line, bar_chart, colour, line_chart, path_panels
 from droidw.slam.frame import Trajectory
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -108,3 +108,9 @@ def test_without_pairs_there_is_no_rpe_to_draw(tmp_path: Path) -> None:
     far = score(still(found.aligned), still(found.truth), delta=Delta(900.0, "seconds"))
     names = [path.name for path in write_plots(Evaluation(far), tmp_path)]
     assert names == ["trajectory.svg", "ate.svg"]
+
+
+def test_no_two_of_many_rows_have_one_colour() -> None:
+    found = [colour(number) for number in range(24)]
+    assert len(set(found)) == 24
+    assert all(re.fullmatch("#[0-9a-f]{6}", one) for one in found)
