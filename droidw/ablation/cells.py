@@ -15,12 +15,12 @@ from droidw.ablation.plan import Footage, Layer, Measuring, Plan
 from droidw.config.load import load_config, override_layers
 from droidw.config.resolve import ResolvedConfig, choose_preset, resolve
 from droidw.errors import DroidwError, InputError, MissingRequirementError, PluginError
-from droidw.io.files import atomic_write
+from droidw.io.files import write_json, write_text
 
 if TYPE_CHECKING:
     from droidw.plugin.manager import Plugins
 
-__all__ = ["Cell", "Outcome", "make_cells", "prepare", "read_outcome", "write_json"]
+__all__ = ["Cell", "Outcome", "make_cells", "prepare", "read_outcome"]
 
 _QUICK: Layer = (
     "ablation",
@@ -237,8 +237,7 @@ def prepare(
     """
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "failure.json").unlink(missing_ok=True)
-    with atomic_write(folder / "cell.yaml") as stream:
-        stream.write(cell.config.encode("utf-8"))
+    write_text(folder / "cell.yaml", cell.config)
     spec = {
         "row": cell.row,
         "sequence": cell.sequence,
@@ -272,12 +271,6 @@ def read_outcome(cell: Cell, folder: Path, measure: Measuring) -> Outcome | None
             record["metrics"], record["facts"], record["curve"], seconds=record.get("seconds", 0.0)
         )
     return None
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON as a whole or not at all."""
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(value, indent=1, allow_nan=False) + "\n").encode("utf-8"))
 
 
 def _read(path: Path) -> dict[str, Any] | None:

@@ -6,10 +6,9 @@ import csv
 import io
 from pathlib import Path
 
-from droidw.ablation.cells import write_json
 from droidw.ablation.page import make_page
 from droidw.ablation.table import Table
-from droidw.io.files import atomic_write
+from droidw.io.files import write_json, write_text
 
 __all__ = ["FILES", "comma_separated", "markdown", "write_files"]
 
@@ -37,8 +36,7 @@ def write_files(table: Table, folder: Path, command: str = "") -> list[Path]:
         "report.html": make_page(table, command),
     }
     for name, content in texts.items():
-        with atomic_write(folder / name) as stream:
-            stream.write(content.encode("utf-8"))
+        write_text(folder / name, content)
     write_json(folder / "table.json", table.to_dict())
     return [folder / name for name in FILES]
 

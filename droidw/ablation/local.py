@@ -12,7 +12,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from droidw.ablation.cells import Cell, Outcome, write_json
+from droidw.ablation.cells import Cell, Outcome
+from droidw.io.files import write_json
 
 __all__ = ["MODULE", "Tell", "attend", "conclude", "launch", "run_local"]
 

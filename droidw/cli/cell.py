@@ -51,9 +51,9 @@ def _run(folder: Path) -> int:
     if code:
         return code
 
-    from droidw.ablation.cells import write_json
     from droidw.ablation.measure import measure_run
     from droidw.ablation.plan import Measuring
+    from droidw.io.files import write_json
 
     record = {key: spec[key] for key in ("row", "sequence", "seed", "digest", "measure")}
     record.update(measure_run(run_dir, Measuring(**spec["measure"])))

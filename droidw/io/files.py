@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from droidw.errors import InputError, UsageError
 
-__all__ = ["atomic_write", "read_text"]
+__all__ = ["atomic_write", "read_text", "write_json", "write_text"]
 
 
 @contextmanager
@@ -35,6 +36,25 @@ def atomic_write(path: Path) -> Iterator[IO[bytes]]:
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a file as a whole or not at all.
+
+    Raises:
+        UsageError: as `atomic_write`.
+    """
+    with atomic_write(path) as stream:
+        stream.write(text.encode("utf-8"))
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write JSON as a whole or not at all.
+
+    Raises:
+        UsageError: as `atomic_write`. ValueError: a number is not finite.
+    """
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def read_text(path: Path, what: str) -> str:

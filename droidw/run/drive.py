@@ -19,13 +19,14 @@ from droidw.eval.masks import score_folder
 from droidw.eval.metrics import score
 from droidw.events import Dispatcher, Progress, RunFailed, RunFinished, RunStarted
 from droidw.geometry.camera import Rectifier
+from droidw.io.files import write_json, write_text
 from droidw.io.prefetch import prefetch
 from droidw.io.tum import write_tum
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
 from droidw.run.again import Hidden, rejection, second_time, to_hide
 from droidw.run.cameras import choose_camera, open_masks
-from droidw.run.folder import listed, prepare, withdraw, write_json, write_text
+from droidw.run.folder import listed, prepare, withdraw
 from droidw.run.machine import run_device, settle
 from droidw.run.manifest import REPORTS, facts_of_setup, facts_of_time, facts_of_tracking
 from droidw.run.signals import Stop
@@ -304,16 +305,14 @@ class _Run:
 
     def _export(self, source: FrameSource, outcome: Outcome) -> RunResult:
         warnings = self.events
-        for text in (*outcome.diagnosis.warnings(), *(self.masks.problems() if self.masks else ())):
-            warnings.warn(text)
+        texts = [*outcome.diagnosis.warnings(), *(self.masks.problems() if self.masks else ())]
         for status, count in outcome.reports.items():
-            warnings.warn(REPORTS.get(status, "{count} steps: " + status).format(count=count))
+            texts.append(REPORTS.get(status, "{count} steps: " + status).format(count=count))
         if source.skipped:
             shown = "; ".join(source.problems[:3])
-            warnings.warn(f"{source.skipped} pictures could not be used: {shown}")
-        elif source.problems:
-            for text in source.problems[:5]:
-                warnings.warn(text)
+            texts.append(f"{source.skipped} pictures could not be used: {shown}")
+        for text in texts if source.skipped else [*texts, *source.problems[:5]]:
+            warnings.warn(text)
         truth = source.truth
         if truth is not None:
             write_tum(self.run_dir / "truth.tum", truth)

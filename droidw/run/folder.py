@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
 
 from droidw.errors import UsageError
-from droidw.io.files import atomic_write
 
-__all__ = ["FILES", "listed", "prepare", "withdraw", "write_json", "write_text"]
+__all__ = ["FILES", "listed", "prepare", "withdraw"]
 
 FILES: Mapping[str, str] = {
     "trajectory.tum": "pose of every input frame: t tx ty tz qx qy qz qw, camera to world",
@@ -108,14 +105,3 @@ def _clear(path: Path) -> None:
                 entry.unlink()
     else:
         path.unlink(missing_ok=True)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file as a whole or not at all."""
-    with atomic_write(path) as stream:
-        stream.write(text.encode("utf-8"))
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON as a whole or not at all."""
-    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")

@@ -56,18 +56,17 @@ class Frontend:
         self._recent = 1
         self._published = "droid-w" in config.compat
 
-    def grow(self, forced: bool = False, last: bool = False) -> int | None:
+    def grow(self, forced: bool = False) -> int | None:
         """Deal with the keyframe just appended to the store.
 
         Args:
             forced: the keyframe was forced by a frame count and may not be dropped.
-            last: no further frame follows, so that initialisation cannot wait.
         Returns:
             The number of the keyframe that was dropped for it, or None.
         """
         if self.initialised:
             return self._window(forced)
-        if len(self.store) >= self.options.warmup or (last and len(self.store) >= 2):
+        if len(self.store) >= self.options.warmup:
             self.initialise()
         return None
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +11,7 @@ import numpy.typing as npt
 from droidw.errors import UsageError
 from droidw.io.files import atomic_write
 
-__all__ = ["make_folder", "write_map", "write_scale"]
+__all__ = ["make_folder", "write_map"]
 
 
 def make_folder(path: Path) -> None:
@@ -43,13 +40,3 @@ def write_map(path: Path, values: npt.NDArray[np.uint16] | npt.NDArray[np.uint8]
         raise ValueError(f"OpenCV cannot write a PNG of shape {values.shape}, {values.dtype}")
     with atomic_write(path) as stream:
         stream.write(data.tobytes())
-
-
-def write_scale(path: Path, facts: Mapping[str, Any]) -> None:
-    """Write what the values of a folder of maps mean, as JSON.
-
-    Raises:
-        UsageError: the file cannot be written.
-    """
-    with atomic_write(path) as stream:
-        stream.write((json.dumps(facts, indent=2, allow_nan=False) + "\n").encode("utf-8"))

@@ -138,7 +138,8 @@ class DepthExporter:
         keep: npt.NDArray[np.bool_],
         folder: Path,
     ) -> list[Path]:
-        from droidw_plugins.exporters._maps import write_map, write_scale
+        from droidw.io.files import write_json
+        from droidw_plugins.exporters._maps import write_map
 
         scale = self._scale or scale_for(depth[keep])
         written, too_far = [], 0
@@ -160,7 +161,7 @@ class DepthExporter:
             "picture": [result.camera.width, result.camera.height],
         }
         path = folder / "scale.json"
-        write_scale(path, facts)
+        write_json(path, facts)
         if self._full:
             written += _enlarged(result, keep, scale, folder / "full")
         return [*written, path]

@@ -105,7 +105,8 @@ class UncertaintyExporter:
 
     def _write_masks(self, result: RunResult, folder: Path) -> list[Path]:
         from droidw.geometry.spread import closed
-        from droidw_plugins.exporters._maps import write_map, write_scale
+        from droidw.io.files import write_json
+        from droidw_plugins.exporters._maps import write_map
 
         height, width = result.keyframes[0].image.shape[:2]
         size, written = (width, height), []
@@ -121,11 +122,12 @@ class UncertaintyExporter:
             "index": "of the frame in the source, counted from 0",
             "picture": list(size),
         }
-        write_scale(folder / "scale.json", facts)
+        write_json(folder / "scale.json", facts)
         return [*written, folder / "scale.json"]
 
     def _write_maps(self, result: RunResult, folder: Path) -> list[Path]:
-        from droidw_plugins.exporters._maps import write_map, write_scale
+        from droidw.io.files import write_json
+        from droidw_plugins.exporters._maps import write_map
 
         written = []
         for keyframe in result.keyframes:
@@ -142,7 +144,7 @@ class UncertaintyExporter:
             "offset": result.offset,
             "picture": [result.camera.width, result.camera.height],
         }
-        write_scale(path, facts)
+        write_json(path, facts)
         return [*written, path]
 
     def _write_video(self, result: RunResult, folder: Path) -> Path:
