@@ -90,13 +90,6 @@ class MotionFilterConfig:
         ge=0,
         le=1,
     )
-    hidden_denser: float = opt(
-        0.36,
-        "share by which keyframes come nearer besides where a fifth of a picture is set aside or "
-        "masked (from a tenth on little by little), with more edges for what they span (0: not)",
-        ge=0,
-        lt=1,
-    )
     force_every: int = opt(0, "a keyframe at least every n frames (0: never forced)", ge=0)
     min_matched: float = opt(
         0.4,

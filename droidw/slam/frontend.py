@@ -227,7 +227,7 @@ class Frontend:
         if self._drops >= _MOST_DROPS:
             return None
         hidden = self.store["movable"][count - 1 :], self.store["unmasked"][count - 1 :]
-        step = spans(*hidden, self.config.motion_filter, keyframes=True)
+        step = spans(*hidden, self.config.motion_filter)
         limit = options.keyframe_threshold * float(step[0])
         near = self._between(count - 2, count - 1) < limit
         return count - 1 if near and not self._doubtful() else None

@@ -30,7 +30,7 @@ __all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "spans"]
 # Most of a picture is taken to stand still, whatever could move; and of pictures in which nothing
 # does, up to a tenth is taken for what can. In between it counts little by little: no one cell
 # decides.
-_LEAST_HIDDEN, _MUCH_HIDDEN, _PLAINLY_HIDDEN, _MOST_HIDDEN = 0.1, 0.2, 0.3, 0.5
+_LEAST_HIDDEN, _PLAINLY_HIDDEN, _MOST_HIDDEN = 0.1, 0.3, 0.5
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class MotionFilter:
         """
         gone = [hidden.cpu() for hidden in (cells, masked) if hidden is not None]
         if gone:
-            near = float(nearness(torch.stack(gone).any(dim=0), self._options, keyframes=True))
+            near = float(nearness(torch.stack(gone).any(dim=0), self._options))
             self._threshold = self._options.threshold * near
         if cells is not None:
             payload = self._correspondence.aside(current.payload, gone[0])  # type: ignore[attr-defined]
@@ -182,43 +182,30 @@ class MotionFilter:
                 self._candidates[self._open] = self._judged
 
 
-def nearness(
-    cells: Tensor, options: MotionFilterConfig, *, keyframes: bool
-) -> npt.NDArray[np.float64]:
-    """In [0,1], by what keyframes come nearer where cells, bool [...,h,w], tell nothing, [...].
-
-    Args:
-        keyframes: how near they come; else what of that a graph is thinned by, so that where much
-            is hidden there are more edges for what keyframes span, as each of them tells less.
-    """
+def nearness(cells: Tensor, options: MotionFilterConfig) -> npt.NDArray[np.float64]:
+    """In [0,1], by what keyframes come nearer where cells, bool [...,h,w], tell nothing, [...]."""
     share = cells.float().mean(dim=(-2, -1)).double().cpu().numpy()
-
-    def counts(full: float) -> npt.NDArray[np.float64]:
-        return np.clip((share - _LEAST_HIDDEN) / (full - _LEAST_HIDDEN), 0.0, 1.0)
-
-    hidden = counts(_PLAINLY_HIDDEN) * np.minimum(share, _MOST_HIDDEN)
+    counts = np.clip((share - _LEAST_HIDDEN) / (_PLAINLY_HIDDEN - _LEAST_HIDDEN), 0.0, 1.0)
+    hidden = counts * np.minimum(share, _MOST_HIDDEN)
     near: npt.NDArray[np.float64] = 1.0 - options.movable_nearer * hidden
-    if keyframes:
-        near = near * (1.0 - options.hidden_denser * counts(_MUCH_HIDDEN))
     return near
 
 
 def spans(
-    movable: Tensor, unmasked: Tensor, options: MotionFilterConfig, *, keyframes: bool = False
+    movable: Tensor, unmasked: Tensor, options: MotionFilterConfig
 ) -> npt.NDArray[np.float64]:
     """What part of a usual step leads to each keyframe, [N].
 
     Args:
         movable: [N,h,w] in [0,1], how much speaks for it that a cell can move.
         unmasked: [N,h,w] in [0,1], what masks leave.
-        keyframes: as of `nearness`.
     """
-    if options.movable_nearer == 0 and not (keyframes and options.hidden_denser > 0):
+    if options.movable_nearer == 0:
         return np.ones(len(movable))
     gone = unmasked < CLOSED
     if options.movable_above > 0:
         gone = gone | (movable > options.movable_above)
-    return nearness(gone, options, keyframes=keyframes)
+    return nearness(gone, options)
 
 
 def look_ahead(

@@ -83,26 +83,21 @@ def test_a_near_keyframe_is_dropped_only_where_tracking_holds(measured, off, kee
     ("rows", "above", "times", "dropped"),
     [(0, 0.1, 1.01, 1), (2, 0.1, 1.49, None), (2, 0.1, 1.51, 1), (2, 0.0, 1.01, 1)],
 )
-@pytest.mark.parametrize("denser", [0.0, 0.5])
 @pytest.mark.parametrize("masked", [False, True])
 def test_keyframes_are_nearer_where_something_is_hidden(
-    measured, rows, above, times, dropped, masked, denser
+    measured, rows, above, times, dropped, masked
 ):
     """Dropped below a distance, which is less by the share of six rows that can move."""
     store, graph, gates = measured
     frontend = Frontend.__new__(Frontend)
     frontend.store, frontend.graph, frontend._drops = store, graph, 0
     frontend.config = SimpleNamespace(
-        motion_filter=MotionFilterConfig(
-            movable_above=above, movable_nearer=1.0, hidden_denser=denser
-        )
+        motion_filter=MotionFilterConfig(movable_above=above, movable_nearer=1.0)
     )
     frontend.optimiser = SimpleNamespace(gates=lambda: gates)
     frontend.options = FrontendConfig()
     distance = frontend._between(0, 1)
     frontend.options.keyframe_threshold = times * distance
-    if rows and above:
-        frontend.options.keyframe_threshold /= 1.0 - denser
     if masked:  # whatever is asked of what can move
         store["unmasked"][1, : rows if above else 0] = 0.0
     else:

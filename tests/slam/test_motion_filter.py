@@ -144,37 +144,6 @@ def test_a_few_cells_bring_no_keyframe_nearer(aside, near):
 
 
 @pytest.mark.parametrize(
-    ("aside", "near"), [(0, 1.0), (2, 1.0), (3, 0.75), (4, 0.5), (6, 0.5), (20, 0.5)]
-)
-def test_keyframes_come_nearer_still_and_keep_the_edges_of_what_they_span(aside, near):
-    """From a fifth of twenty cells on in full; a graph is not thinned by it."""
-    movable, whole = (torch.arange(20).view(1, 4, 5) < aside) * 0.2, torch.ones(1, 4, 5)
-    options = MotionFilterConfig(movable_nearer=0.0, hidden_denser=0.5)
-    assert spans(movable, whole, options, keyframes=True) == pytest.approx([near])
-    assert spans(whole * 0, 1.0 - 5.0 * movable, options, keyframes=True) == pytest.approx([near])
-    assert spans(movable, whole, options) == [1.0]
-    both = replace(options, movable_nearer=1.0)
-    steps = spans(movable, whole, both)
-    assert spans(movable, whole, both, keyframes=True) == pytest.approx(near * steps)
-    neither = replace(options, hidden_denser=0.0)
-    assert spans(movable, whole, neither, keyframes=True) == [1.0]
-
-
-@pytest.mark.parametrize(
-    ("aside", "nearer", "denser", "limit"), [(1, 0.0, 0.4, 0.75), (1, 1.0, 0.4, 0.609375)]
-)
-def test_a_keyframe_is_taken_earlier_where_much_is_hidden(aside, nearer, denser, limit):
-    cells, blank = torch.arange(4).view(2, 2) < aside, torch.zeros(0)
-    frames = [Encoded(Frame(k, k / 30, blank, blank), k) for k in range(2)]
-    for flow, keeps in ((limit - 0.01, False), (limit + 0.01, True)):
-        options = MotionFilterConfig(movable_nearer=nearer, hidden_denser=denser)
-        judge = MotionFilter(Moving(flow), options)
-        judge.judge(frames[0])
-        judge.set_aside(frames[0], cells)
-        assert judge.judge(frames[1]).keep == keeps
-
-
-@pytest.mark.parametrize(
     ("aside", "nearer", "limit"),
     [(0, 1.0, 1.25), (1, 1.0, 1.015625), (1, 0.5, 1.1328125), (1, 0.0, 1.25), (3, 1.0, 0.625)],
 )
@@ -189,15 +158,13 @@ def test_keyframes_come_nearer_where_something_is_hidden(aside, nearer, limit, h
         "both": (torch.zeros_like(cells), cells),
     }[how]
     for flow, keeps in ((limit - 0.01, False), (limit + 0.01, True)):
-        judge = MotionFilter(
-            Moving(flow), MotionFilterConfig(movable_nearer=nearer, hidden_denser=0.0)
-        )
+        judge = MotionFilter(Moving(flow), MotionFilterConfig(movable_nearer=nearer))
         judge.judge(frames[0])
         judge.set_aside(frames[0], *gone)
         assert judge.judge(frames[1]).keep == keeps
 
     moving = Moving(1.3)
-    judge = MotionFilter(moving, MotionFilterConfig(movable_nearer=nearer, hidden_denser=0.0))
+    judge = MotionFilter(moving, MotionFilterConfig(movable_nearer=nearer))
     judge.judge(frames[0])
     judge.set_aside(frames[0], *gone)
     assert judge.judge(frames[1]).keep
