@@ -15,6 +15,7 @@ from droidw.ablation.plan import Footage, Layer, Measuring, Plan
 from droidw.config.load import load_config, override_layers
 from droidw.config.resolve import ResolvedConfig, choose_preset, resolve
 from droidw.errors import DroidwError, InputError, MissingRequirementError, PluginError
+from droidw.io.dataset_tables import data_root, split_source, table_names
 from droidw.io.files import write_json, write_text
 
 if TYPE_CHECKING:
@@ -106,8 +107,8 @@ def make_cells(
     and what varies with it.
 
     Args:
-        plugin_files, data: as of `prepare`. Where a file changes, or the folder in which a dataset
-            lies, finished cells run again.
+        plugin_files, data: as of `prepare`. Where a file changes (itself, not what it imports), or
+            the folder in which a dataset lies, finished cells run again.
     Returns:
         Cells, row by row, and why a preset was chosen (or "").
     Raises:
@@ -131,11 +132,11 @@ def make_cells(
             # Resolving takes a while, and sequences and seeds often differ in values alone.
             # But for what their dataset says of them.
             named = footage.source if ":" in footage.source else ""
-            there = [str(_folder(data))] if named and data is not None else []
+            there = [str(_folder(data or data_root()))] if _in_a_dataset(named) else []
             beside = "\n".join([*files, *there])
             same = json.dumps([row, footage.layer[1], footage.vary, named], default=str)
             if same not in known:
-                # Every row has the same seeds: what the first one takes of them, all do.
+                # Resolving takes a while: what the first row takes of other seeds, others will.
                 seeds = plan.seeds if row == first and footage.vary else plan.seeds[:1]
                 layers = (_QUICK, plan.base, footage.layer, *said, row_layer)
                 for seed in reversed(seeds):
@@ -143,6 +144,7 @@ def make_cells(
                     loaded = load_config(plan.config, chosen, (), None, (*layers, *varied))
                     try:
                         known[same] = _cell(row, sequence, resolve(loaded, plugins), plan)
+                        problems.pop(same, None)
                     except (MissingRequirementError, PluginError) as error:
                         text = yaml.safe_dump(loaded.data, sort_keys=False)
                         known[same] = Cell(row, sequence, 0, text, missing=error.message)
@@ -170,6 +172,11 @@ def _varied(plan: Plan, footage: Footage, seed: int) -> Iterator[Layer]:
 
 def _place(source: str) -> str:
     return source if ":" in source else str(Path(source).resolve())
+
+
+def _in_a_dataset(source: str) -> bool:
+    parted = split_source(source)
+    return parted is not None and parted[0] in table_names()
 
 
 def _folder(data: Path) -> Path:

@@ -15,11 +15,11 @@ DEFAULT_MAX_DIFF = 0.02
 """Largest difference of two matched stamps in seconds, unless one asks for another."""
 
 
-# By how much the usual step between stamps may differ from that of another unit, as one side may
-# have keyframes alone.
-_COARSER = 30.0
-# Numbers of frames are told from seconds by how many frames there are, as a share of them, and by
-# how much longer that would take.
+# By how much steps between stamps, and how long they last, may differ from those of another unit,
+# as one side may have keyframes alone, or a part.
+_COARSER, _LONGER = 30.0, 10.0
+# Numbers of frames are told from seconds by how much longer these would last; a reference that may
+# have a stamp a second, by how many frames there are as well, as a share of them.
 _AS_MANY, _MUCH_LONGER = 0.2, 3.0
 _INDICES = "these look like frame indices"
 
@@ -174,13 +174,12 @@ def _guess(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64]) -> tuple[
     """What the stamps look like, and what to do about it."""
     if not len(est) or not len(ref):
         return "", "give a trajectory with at least one pose a line: t tx ty tz qx qy qz qw"
-    if counted := _counted(est, ref):
-        return _INDICES, _seconds(counted)
-    spacing = _spacing(est) / _spacing(ref)
+    # By steps and by how long it lasts: a clock that starts elsewhere, or a part, has the same.
+    steps, spans = _spacing(est) / _spacing(ref), _lasting(est) / _lasting(ref)
     for factor, unit in ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")):
-        # By the steps between stamps: a clock that starts elsewhere, or a part, has the same.
-        for steps, word in ((spacing, "estimate"), (1 / spacing, "reference")):
-            if factor / _COARSER < steps < factor * _COARSER:
+        for step, span, word in ((steps, spans, "estimate"), (1 / steps, 1 / spans, "reference")):
+            coarser = factor / _COARSER < step < factor * _COARSER
+            if coarser and factor / _LONGER < span < factor * _LONGER:
                 return (
                     f"the {word} looks like {unit}",
                     f"divide the first column of the {word} by {factor:.0e}",
@@ -211,22 +210,28 @@ def _spacing(times: npt.NDArray[np.float64]) -> float:
 
 
 def _counted(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64]) -> str:
-    """Which side has numbers of the frames that the other has seconds of; empty: neither.
+    """Which side has numbers of frames, while the other has seconds; empty: neither.
 
-    Its last stamp is how many stamps the other has, and not how long that takes.
+    As seconds they would last far longer. Truth can: a run may have ended early, and truth may have
+    a stamp a second; but not just as many seconds as the other side has frames.
     """
-    for mine, other, word in ((est, ref, "estimate"), (ref, est, "reference")):
-        if not _like_indices(mine) or _like_indices(other) or len(other) < 2:
-            continue
-        last = float(mine.max()) + 1
-        as_many = abs(last - len(other)) < _AS_MANY * len(other)
-        if as_many and last > _MUCH_LONGER * float(np.ptp(other)):
-            return word
+    if len(est) < 2 or len(ref) < 2:
+        return ""
+    if _like_indices(est) and not _like_indices(ref):
+        return "estimate" if est.max() > _MUCH_LONGER * np.ptp(ref) else ""
+    if _like_indices(ref) and not _like_indices(est):
+        as_many = abs(ref.max() + 1 - len(est)) < _AS_MANY * len(est)
+        return "reference" if as_many and ref.max() > _MUCH_LONGER * np.ptp(est) else ""
     return ""
 
 
 def _seconds(word: str) -> str:
     return f"write the {word} with the seconds of its frames (the first column of rgb.txt)"
+
+
+def _lasting(times: npt.NDArray[np.float64]) -> float:
+    """From the first stamp to the last; 1 where that is nothing."""
+    return float(np.ptp(times)) or 1.0
 
 
 def _like_indices(times: npt.NDArray[np.float64]) -> bool:

@@ -32,8 +32,10 @@ _STRETCH = 0.05
 """Largest relative difference of two ratios of sides that counts as the same shape: cropping to
 whole cells takes off a few pixels."""
 
-_NO_BLACK = 31
-"""Colours of labels are brighter than this in one channel."""
+_LOSSY = (".jpg", ".jpeg")
+_HALF, _MOST_OBJECTS, _COLOURED = 127, 32, 31
+"""Grey levels: what is brighter moves; numbers of objects go so far; channels of a colour differ by
+more."""
 
 
 def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
@@ -185,8 +187,8 @@ def check_shape(
 def read_mask(path: Path) -> npt.NDArray[np.bool_]:
     """A mask [H,W] bool from a picture: True where it moves.
 
-    In colours, as where each object has one, that is everything but black; in grey levels what is
-    brighter than half, or everything but black if nothing is: numbers of objects.
+    That is what is brighter than half, or has a colour, as where each object has one. Where nothing
+    is brighter than a few grey levels, these are numbers of objects, and all but 0 moves.
 
     Raises:
         InputError: if the file is no picture.
@@ -194,11 +196,12 @@ def read_mask(path: Path) -> npt.NDArray[np.bool_]:
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if picture is None:
         raise InputError(f"{path}: cannot be read as a picture")
-    brightest = np.asarray(picture).max(axis=2)
-    coloured = bool((picture.min(axis=2) != brightest).any())
-    # the black of a JPEG in colours is not clean
-    least = _NO_BLACK if coloured else 127
-    return np.asarray(brightest > (0 if brightest.max(initial=0) <= least else least))
+    brightest, darkest = np.asarray(picture).max(axis=2), np.asarray(picture).min(axis=2)
+    if path.suffix.lower() in _LOSSY:  # its black is not clean, and its grey not without colour
+        return np.asarray(brightest > _HALF)
+    if np.array_equal(brightest, darkest) and brightest.max(initial=0) <= _MOST_OBJECTS:
+        return np.asarray(brightest > 0)
+    return np.asarray((brightest > _HALF) | (brightest - darkest > _COLOURED))
 
 
 def read_uncertainty(path: Path) -> npt.NDArray[np.uint16]:

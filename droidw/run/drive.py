@@ -150,9 +150,10 @@ class _Run:
         )
         if guessed:
             self.events.warn(f"camera: {self.said}")
-        if self.config.input.masks:
-            whole = open_source(self.resolved, self.plugins, self.context, whole=True)
-            self.masks = open_masks(self.config.input, whole)
+        given, parts = self.config.input, (self.resolved, self.plugins, self.context)
+        if given.masks:
+            whole = open_source(*parts, whole=True) if given.max_frames else source
+            self.masks = open_masks(given, whole)
         self.context = replace(self.context, camera=camera)
         able = self.resolved.parts["correspondence"][0].capabilities
         threads = "threads" in able or (self.device.type == "cuda" and "gpu-threads" in able)

@@ -183,10 +183,13 @@ class SlamSystem:
         return replace(current, context=context, plain=plain)
 
     def _with_movable(self, current: Encoded) -> Encoded:
-        """What can move in a keyframe, where that is asked; the filter is told what is hidden."""
+        """What can move in a keyframe, where anyone asks; the filter is told what is hidden."""
         above, frame = self.config.motion_filter.movable_above, current.frame
         aside = self._aside and above > 0
-        movable = self._maps.movable(frame) if self.optimiser.begins else None
+        # Uncertainty begins with the first keyframes, and learns anew with all of them.
+        anew = self.config.backend.learn or not self.frontend.initialised
+        asked = self._renews or aside or (self.optimiser.begins and anew)
+        movable = self._maps.movable(frame) if asked else None
         cells = movable > above if aside and movable is not None else None
         masked = None if frame.mask is None else self._maps.unmasked(frame) < CLOSED
         self._filter.set_aside(current, cells, masked)

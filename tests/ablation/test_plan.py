@@ -91,7 +91,9 @@ def test_what_cannot_vary_is_refused_with_the_file(plan, plugins, vary, seeds, s
     assert said in str(caught.value)
 
 
-def test_a_cell_depends_on_plugin_files_and_where_datasets_lie(plan, plugins, tmp_path):
+def test_a_cell_depends_on_plugin_files_and_where_datasets_lie(
+    plan, plugins, tmp_path, monkeypatch
+):
     file = tmp_path / "part.py"
     file.write_text("# nothing yet\n")
     found = plan(["full"])
@@ -104,15 +106,19 @@ def test_a_cell_depends_on_plugin_files_and_where_datasets_lie(plan, plugins, tm
     assert not set(plain) & set(with_plugin)
     file.write_text("# something else\n")
     assert not set(with_plugin) & set(digests(plugin_files=[str(file)]))
-    # Where folders of pictures lie is in the configuration already.
+    # Where folders of pictures lie is in the configuration already; rendered ones lie nowhere.
     assert digests(data=tmp_path / "elsewhere") == plain
     dataset = tmp_path / "p.yaml"
     dataset.write_text(
-        "preset: paper\nsequences: {a: {source: 'bonn:balloon'}}\n"
+        "preset: paper\nsequences: {a: {source: 'bonn:balloon'}, b: {source: 'synthetic:orbit'}}\n"
         "rows: {full: {features: none, depth: none, uncertainty: none, correspondence: flow}}\n"
     )
     found = load_plan(str(dataset))
-    assert len({*digests(), *digests(data=tmp_path), *digests(data=tmp_path / "elsewhere")}) == 3
+    places = [{}, {"data": tmp_path}, {"data": tmp_path / "elsewhere"}]
+    balloon, orbit = zip(*(digests(**place) for place in places), strict=True)
+    assert (len(set(balloon)), len(set(orbit))) == (3, 1)
+    monkeypatch.setenv("DROIDW_DATA", str(tmp_path / "elsewhere"))
+    assert digests()[0] == balloon[2]
 
 
 def test_sequences_with_settings_and_sources(tmp_path, plugins):

@@ -87,6 +87,34 @@ def test_a_clock_of_another_unit_may_start_anywhere_and_last_less_long(factor: f
         associate(seconds, part)
 
 
+@pytest.mark.parametrize(
+    ("est", "ref"),
+    [
+        (np.arange(600.0), 1.3e9 + np.arange(2000) / 100),  # TUM: truth at 100 Hz
+        (np.arange(600.0), 1.4e9 + np.arange(6000) / 200),  # EuRoC: at 200 Hz
+        (np.arange(0.0, 99.0, 7), 1.3e9 + np.arange(800) / 30),  # keyframes of a part
+    ],
+)
+def test_frame_indices_are_no_clock_of_another_unit(est, ref) -> None:
+    with pytest.raises(InputError, match="frame indices"):
+        associate(est, ref)
+    with pytest.raises(InputError, match="frame indices"):
+        associate(ref, est)
+
+
+def test_keyframes_beside_a_fast_truth_are_of_another_clock_and_no_other_unit() -> None:
+    with pytest.raises(InputError, match="s apart") as caught:
+        associate(np.arange(0.0, 30.0, 0.3), 1.4e9 + np.arange(6000) / 200)
+    assert "--t-offset 1400000000" in caught.value.hint
+
+
+@pytest.mark.parametrize(("last", "rate"), [(300, 100), (300, 200), (100, 30), (96, 10)])
+def test_indices_of_an_estimate_are_none_where_they_would_last_too_long(last, rate) -> None:
+    """Whatever the rate of a truth of ten seconds, and how many frames were tracked."""
+    with pytest.raises(InputError, match="frame indices"):
+        associate(np.arange(float(last)), np.arange(10 * rate) / rate)
+
+
 @pytest.mark.parametrize("step", [1, 7])
 def test_frame_indices_are_no_seconds_where_some_of_them_are_as_large(step: int) -> None:
     """Frames 0, 1, ... 9 are as many seconds into 300 frames of ten seconds."""

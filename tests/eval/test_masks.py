@@ -223,12 +223,23 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
         ([0, 100, 128, 255], [0, 0, 1, 1]),  # soft edges
         ([0, 0, 0, 0], [0, 0, 0, 0]),
         ([[0, 0, 0], [0, 0, 128], [0, 128, 0], [64, 0, 0]], [0, 1, 1, 1]),  # of DAVIS
-        ([[0, 0, 0], [3, 0, 1], [0, 128, 0], [255, 255, 255]], [0, 0, 1, 1]),  # no clean black
+        ([[0, 0, 0], [3, 0, 1], [0, 128, 0], [255, 255, 255]], [0, 0, 1, 1]),
+        ([[0, 0, 0], [3, 0, 1], [60, 60, 60], [90, 100, 90]], [0, 0, 0, 0]),  # one odd pixel
+        ([0, 3, 60, 100], [0, 0, 0, 0]),  # soft, and nothing is left of what moved
     ],
 )
 def test_what_moves_in_masks_of_all_kinds(tmp_path: Path, picture, moves) -> None:
     cv2.imwrite(str(tmp_path / "m.png"), np.array([picture], np.uint8))
     assert read_mask(tmp_path / "m.png").tolist() == [[bool(one) for one in moves]]
+
+
+def test_the_black_of_a_jpeg_is_not_clean(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).normal(0, 6, (32, 32, 3)).clip(0, 30).astype(np.uint8)
+    for right in (0, 255):
+        noise[:, 16:] = right
+        cv2.imwrite(str(tmp_path / "m.jpg"), noise)
+        mask = read_mask(tmp_path / "m.jpg")
+        assert not mask[:, :15].any() and mask[:, 17:].all() == (right > 0)
 
 
 def test_the_first_maps_may_be_left_out(tmp_path: Path) -> None:

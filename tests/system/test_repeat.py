@@ -107,7 +107,10 @@ LEARNED = ("features=cnn", "uncertainty=affine-softplus", "uncertainty.options.m
 @pytest.mark.parametrize("threaded", [False, True])
 @pytest.mark.parametrize(("keep", "above"), [(0.9, 0.0), (0.0, 0.1), (0.9, 0.1), (0.0, 0.0)])
 def test_what_can_move_is_asked_of_all_keyframes(system, keep, above, threaded):
-    """Of all: the model may renew its start, motion is told without it, or all are learned anew."""
+    """Of all: the model may renew its start, motion is told without it, or all are learned anew.
+
+    Of the first ones alone where nobody needs the others.
+    """
     settings = (f"uncertainty.options.movable_keep={keep}", f"motion_filter.movable_above={above}")
     slam, frames = system(threaded, (*LEARNED, *settings))
     features, model, op = slam.parts.features, slam.parts.uncertainty, slam.parts.correspondence
@@ -128,6 +131,16 @@ def test_what_can_move_is_asked_of_all_keyframes(system, keep, above, threaded):
         assert number >= 4 and any(found is one for one in asked)
     for cells, one in zip(aside, asked, strict=False):
         assert torch.equal(cells, one > above)
+
+    asked.clear()
+    slam, frames = system(threaded, (*LEARNED, *settings, "backend.learn=false"))
+    movable = slam.parts.features.movable
+    slam.parts.features.movable = lambda *given: asked.append(movable(*given)) or asked[-1]
+    slam.track(iter(frames))
+    if keep or above:
+        assert len(asked) >= len(slam.store)
+    elif not threaded:
+        assert len(asked) == 4
 
 
 def test_lines_hold_a_rendered_room(system, rendered):

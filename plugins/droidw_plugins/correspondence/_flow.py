@@ -85,6 +85,9 @@ class FlowCorrespondence:
         self.stride = options.stride
         self.offset = (options.stride - 1) / 2
         self._track: Track | None = None
+        # Index of the frame measured last, and the least by which it has grown: the stride.
+        self._newest: int | None = None
+        self._step = 0
         self._raster = Raster(self.stride, self.offset)
         workers = options.workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
@@ -128,10 +131,11 @@ class FlowCorrespondence:
         The search starts where a picture that goes on moving as it did would be: a free search
         loses a camera that is fast before walls with little on them.
         """
+        self._count(reference, current)
         if not (current.texture.max(axis=-1) > 0.5 * self.options.texture).any():
             self._track = None
             return Motion(0.0, 0.0)  # a blank picture agrees with whatever is as bright
-        start = None if self._track is None else self._track.ahead(reference, current)
+        start = None if self._track is None else self._track.ahead(reference, current, self._step)
         flow = self._search(reference, current, start)
         self._latest = (reference.key, current.key), flow
         moved = self._moved(reference, current, lambda a, b: flow)
@@ -140,6 +144,13 @@ class FlowCorrespondence:
         known = motion.matched > _TRACKED
         self._track = Track.after(self._track, reference, current, flow) if known else None
         return motion
+
+    def _count(self, reference: FlowFrame, current: FlowFrame) -> None:
+        """Note by how much the index grows from one frame to the next."""
+        grown = current.index - (reference.index if self._newest is None else self._newest)
+        self._newest = current.index
+        if grown > 0:
+            self._step = min(self._step or grown, grown)
 
     def aside(self, payload: FlowFrame, cells: Tensor) -> FlowFrame:
         """The frame, as one whose `cells`, bool [h,w], do not tell how far a picture moved."""

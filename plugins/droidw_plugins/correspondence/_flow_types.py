@@ -134,36 +134,35 @@ class Track:
     Attributes:
         reference, current: frames between which `flow` holds.
         flow: [H,W,2] pixels, reference to current.
-        velocity: [H,W,2] pixels per frame.
-        step: by how much the index grows from one frame to the next, if none is missing.
+        velocity: [H,W,2] pixels per frame of the source.
     """
 
     reference: int
     current: int
     flow: Array
     velocity: Array
-    step: int
 
     @classmethod
     def after(
         cls, before: Track | None, reference: FlowFrame, current: FlowFrame, flow: Array
     ) -> Track:
         """The track one measurement later."""
-        step = current.index - (reference.index if before is None else before.current)
-        step = max(step if before is None else min(step, before.step), 1)
         if before is not None and before.reference == reference.index:
             velocity = (flow - before.flow) / np.float32(max(current.index - before.current, 1))
         else:
             velocity = flow / np.float32(max(current.index - reference.index, 1))
-        return cls(reference.index, current.index, flow, velocity, step)
+        return cls(reference.index, current.index, flow, velocity)
 
-    def ahead(self, reference: FlowFrame, current: FlowFrame) -> Array | None:
+    def ahead(self, reference: FlowFrame, current: FlowFrame, step: int) -> Array | None:
         """The flow from `reference` to a later frame if all goes on; None if that is unknown.
 
         The velocity belongs to pixels of an older frame: good enough for a start.
+
+        Args:
+            step: by how much the index grows from one frame to the next, if none is missing.
         """
         gap = current.index - self.current
-        if not 0 < gap <= _LONGEST_GAP * self.step:
+        if not 0 < gap <= _LONGEST_GAP * step:
             return None
         going_on: Array = self.velocity * np.float32(gap)
         if reference.index == self.reference:

@@ -53,7 +53,7 @@ class AffineSoftplusOptions(ObjectiveOptions):
         default=0.0,
         metadata={
             "help": "fit anew at every keyframe, with this share of what earlier ones counted "
-            "(0: the keyframes of the initialisation only)",
+            "(0: while tracking, the keyframes of the initialisation only)",
             "ge": 0,
             "le": 1,
         },
