@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from droidw.ablation.cells import Cell, Outcome
 from droidw.ablation.plan import Plan
 
 __all__ = ["COLUMNS", "Column", "Entry", "Table", "make_table"]
+
+
+# Of an error that is shown, and after the point.
+_SIGNIFICANT, _MOST_DIGITS = 3, 8
 
 
 @dataclass(frozen=True)
@@ -226,6 +230,18 @@ def make_table(plan: Plan, cells: Sequence[tuple[Cell, Outcome | None]]) -> Tabl
     units = {str(o.facts.get("unit", "m")) for _, o in cells if o is not None and o.facts}
     have = {key for _, o in cells if o is not None for key in o.metrics}
     columns = tuple(
-        COLUMNS.get(key, Column(key, key, lower=None)) for key in plan.columns if key in have
+        _fine(COLUMNS.get(key, Column(key, key, lower=None)), cells)
+        for key in plan.columns
+        if key in have
     )
     return Table(plan, " or ".join(sorted(units)) or "m", columns, tuple(cells))
+
+
+def _fine(column: Column, cells: Sequence[tuple[Cell, Outcome | None]]) -> Column:
+    """The column with as many digits as its least error needs, if it is one of errors."""
+    if column.digits != Column.digits:
+        return column
+    values = [o.metrics.get(column.key, 0.0) for _, o in cells if o is not None]
+    least = min((value for value in values if value > 0), default=1.0)
+    digits = _SIGNIFICANT - 1 - math.floor(math.log10(least))
+    return replace(column, digits=min(max(column.digits, digits), _MOST_DIGITS))

@@ -153,3 +153,20 @@ def test_page():
     ElementTree.fromstring(text.replace("<meta name='viewport' content='width=device-width'>", ""))
     assert text.count("class='best'") == 2  # ATE and AUC, one sequence
     assert make_page(found, "x") == make_page(found, "x")
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ([0.0343, 0.5], ["0.0343", "0.5000"]),
+        ([0.000445, 0.0448], ["0.000445", "0.044800"]),
+        ([0.0, 0.0012], ["0.00000", "0.00120"]),
+        ([3e-12, 1.0], ["0.00000000", "1.00000000"]),
+    ],
+)
+def test_errors_have_as_many_digits_as_the_least_of_them_needs(values, said):
+    found = table({("full", "a"): [values[0]], ("r", "a"): [values[1]]}, seeds=(0,))
+    grid = found.grid(found.columns[0])
+    assert [row[1] for row in grid[1:]] == said
+    auc = found.grid(found.columns[1])
+    assert all(len(row[1].partition(".")[2]) == 3 for row in auc[1:])
