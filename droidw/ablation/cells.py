@@ -124,7 +124,7 @@ def make_cells(
     said = override_layers(overrides)
     files = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in plugin_files]
     first = next(iter(plan.rows), "")
-    problems: dict[str, DroidwError] = {}
+    failed: DroidwError | None = None
     known: dict[str, Cell] = {}
     cells: list[Cell] = []
     for row, row_layer in plan.rows.items():
@@ -144,19 +144,18 @@ def make_cells(
                     loaded = load_config(plan.config, chosen, (), None, (*layers, *varied))
                     try:
                         known[same] = _cell(row, sequence, resolve(loaded, plugins), plan)
-                        problems.pop(same, None)
                     except (MissingRequirementError, PluginError) as error:
                         text = yaml.safe_dump(loaded.data, sort_keys=False)
                         known[same] = Cell(row, sequence, 0, text, missing=error.message)
-                        problems[same] = error
+                        failed = failed or error
             for seed in plan.seeds:
                 values = {"seed": seed, "input.source": _place(footage.source)}
                 values |= dict.fromkeys(footage.vary, seed)
                 config = _with(known[same].config, values)
                 cell = replace(known[same], sequence=sequence, seed=seed, config=config)
                 cells.append(replace(cell, beside=beside))
-    if problems and len(problems) == len(known):
-        raise next(iter(problems.values()))
+    if failed is not None and all(cell.missing for cell in known.values()):
+        raise failed
     return cells, note
 
 

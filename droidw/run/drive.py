@@ -28,7 +28,7 @@ from droidw.run.again import Hidden, rejection, second_time, to_hide
 from droidw.run.cameras import choose_camera, open_masks
 from droidw.run.folder import listed, prepare, withdraw
 from droidw.run.machine import run_device, settle
-from droidw.run.manifest import REPORTS, facts_of_setup, facts_of_time, facts_of_tracking
+from droidw.run.manifest import facts_of_setup, facts_of_time, facts_of_tracking, told
 from droidw.run.signals import Stop
 from droidw.run.sources import open_source
 from droidw.slam.frame import RunResult
@@ -305,15 +305,15 @@ class _Run:
         }
 
     def _export(self, source: FrameSource, outcome: Outcome) -> RunResult:
-        warnings = self.events
         texts = [*outcome.diagnosis.warnings(), *(self.masks.problems() if self.masks else ())]
-        for status, count in outcome.reports.items():
-            texts.append(REPORTS.get(status, "{count} steps: " + status).format(count=count))
+        texts += told(outcome.reports)
         if source.skipped:
-            shown = "; ".join(source.problems[:3])
-            texts.append(f"{source.skipped} pictures could not be used: {shown}")
-        for text in texts if source.skipped else [*texts, *source.problems[:5]]:
-            warnings.warn(text)
+            why = "; ".join(source.problems[:3])
+            texts.append(f"{source.skipped} pictures could not be used: {why}")
+        else:
+            texts += source.problems[:5]
+        for text in texts:
+            self.events.warn(text)
         truth = source.truth
         if truth is not None:
             write_tum(self.run_dir / "truth.tum", truth)
@@ -338,15 +338,15 @@ class _Run:
                 except Exception as error:  # noqa: BLE001 - one exporter must not cost the others
                     _log.debug("exporter %s raised", component.name, exc_info=True)
                     kind = "" if isinstance(error, DroidwError) else f"{type(error).__name__}: "
-                    warnings.warn(f"exporter '{component.name}' failed: {kind}{error}")
+                    self.events.warn(f"exporter '{component.name}' failed: {kind}{error}")
                 self.events.emit(Progress("export", done + 1, total))
         metrics = self._score_masks(metrics)
         if metrics is not None:
             write_json(self.run_dir / "metrics.json", metrics)
         # Exporters take time and write files; all else holds.
         manifest = {**result.manifest, **self._facts_of_time(outcome), **self._files()}
-        result = replace(result, manifest=manifest, warnings=tuple(warnings.warnings))
-        write_json(self.run_dir / "manifest.json", {**manifest, "warnings": warnings.warnings})
+        result = replace(result, manifest=manifest, warnings=tuple(self.events.warnings))
+        write_json(self.run_dir / "manifest.json", {**manifest, "warnings": self.events.warnings})
         self.events.emit(RunFinished(result, self.run_dir, metrics))
         return result
 

@@ -17,6 +17,7 @@ from droidw.io.weights import fingerprint
 from droidw.plugin.weights import find_weights, weights_name
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
     from droidw.config.resolve import ResolvedConfig
@@ -25,12 +26,12 @@ if TYPE_CHECKING:
     from droidw.slam.timing import Stopwatch
 
 __all__ = [
-    "REPORTS",
     "describe_parts",
     "facts_of_setup",
     "facts_of_time",
     "facts_of_tracking",
     "peak_memory_mb",
+    "told",
     "versions",
 ]
 
@@ -103,7 +104,7 @@ def peak_memory_mb() -> float:
     return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
-REPORTS = {
+_REPORTS = {
     "rejected": "{count} bundle adjustment steps were rejected, since none lowered the energy",
     "singular": "{count} bundle adjustment steps could not be solved (singular system)",
     "nonfinite": "{count} bundle adjustment steps were not finite and were left out",
@@ -114,6 +115,14 @@ REPORTS = {
     "finite (left out): the uncertainty model is at fault",
 }
 """What the optimiser counts -> the sentence for the user."""
+
+
+def told(reports: Mapping[str, int]) -> list[str]:
+    """A sentence for each status that was counted."""
+    return [
+        _REPORTS.get(status, "{count} steps: " + status).format(count=count)
+        for status, count in reports.items()
+    ]
 
 
 def facts_of_tracking(source: FrameSource, outcome: Outcome) -> dict[str, Any]:

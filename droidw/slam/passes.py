@@ -77,8 +77,7 @@ def last_passes(options: BackendConfig, wide: bool) -> tuple[Pass, ...]:
     Args:
         wide: as of `all_passes`.
     """
-    end = [part.kernel for part in all_passes(options, wide)][-1:]
-    kernels = [kernel for kernel in _LAST if end and _LAST.index(kernel) <= _LAST.index(end[0])]
-    updates = options.passes[-len(kernels) :]
-    kernels = kernels[len(kernels) - len(updates) :]
-    return tuple(Pass(count, kernel) for count, kernel in zip(updates, kernels, strict=True))
+    made = all_passes(options, wide)
+    kernels = _LAST[: _LAST.index(made[-1].kernel) + 1] if made else ()
+    last = zip(reversed(options.passes), reversed(kernels), strict=False)
+    return tuple(Pass(count, kernel) for count, kernel in last)[::-1]
