@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -37,6 +36,7 @@ from droidw_plugins.correspondence._flow_mask import (
 from droidw_plugins.correspondence._flow_motion import picture_motion
 from droidw_plugins.correspondence._flow_polish import polished
 from droidw_plugins.correspondence._flow_raster import Raster
+from droidw_plugins.correspondence._flow_search import DenseSearch
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import (
@@ -66,11 +66,9 @@ _FULL_FIELDS = 64
 _TRACKED = 0.1
 # Grid flows kept for the filler: some ten kilobytes each.
 _GRID_FIELDS = 20_000
-# Pixels between a seed and the flow that was found for which a search sets out from the seeds; the
-# coarsest level of that search, on which a pixel is four, and how many times as sure a match of it
-# has to be.
+# Pixels between a seed and the flow that was found for which a search sets out from the seeds, and
+# how many times as sure a match of it has to be.
 _SEEDED = 1.5
-_NEAR_SCALE = 2
 _CLEARLY = 1.05
 # Checked pairs kept for the next session that asks for them, and what was found between whole
 # pictures: some forty kilobytes each.
@@ -91,7 +89,7 @@ class FlowCorrespondence:
         self._raster = Raster(self.stride, self.offset)
         workers = options.workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
-        self._local = threading.local()
+        self._dense = DenseSearch(options, self._raster)
         self._latest: tuple[_Pair, Array] | None = None
         self._full: Kept[_Pair, Array] = Kept(_FULL_FIELDS)
         self._grid: Kept[_Pair, Array] = Kept(_GRID_FIELDS)
@@ -184,31 +182,14 @@ class FlowCorrespondence:
         start: Array | None = None,
         fine: bool = False,
         near: bool = False,
+        warped: bool = False,
     ) -> Array:
-        """Dense flow a -> b, [H,W,2] pixels; `fine` as for global adjustment, `near` the start."""
-        # An engine remembers that it was once given a start, and answers differently ever after:
-        # one for each use, or the result would depend on which thread did what before.
-        options = self.options
-        scale = options.global_scale if fine else options.finest_scale
-        refinement = options.global_refinement if fine else options.refinement
-        kind = "free" if start is None else "near" if near else "started"
-        name = f"{kind}-{scale}-{refinement}"
-        engine: Any = getattr(self._local, name, None)
-        if engine is None:
-            engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-            engine.setFinestScale(scale)
-            engine.setGradientDescentIterations(options.iterations)
-            engine.setVariationalRefinementIterations(refinement)
-            engine.setPatchSize(options.patch_size)
-            engine.setPatchStride(options.patch_stride)
-            room = min(a.grey.shape) >> _NEAR_SCALE >= 2 * options.patch_size
-            if near and room and hasattr(engine, "setCoarsestScale"):  # OpenCV from 4.13 on
-                engine.setCoarsestScale(max(scale, _NEAR_SCALE))
-            setattr(self._local, name, engine)
+        """Dense flow a -> b, [H,W,2] pixels; see `DenseSearch`."""
         moved = None if start is None else sample(start, a.centres)
         grey = as_bright(b.grey, self._gain(a, b, moved))
-        flow: Array = engine.calc(a.grey, grey, None if start is None else start.copy())
-        return flow
+        if warped and start is not None:
+            return self._dense.warped(a.grey, grey, start, fine=fine)
+        return self._dense(a.grey, grey, start, fine=fine, near=near)
 
     def _gain(self, a: FlowFrame, b: FlowFrame, moved: Array | None) -> float:
         """What exposure made of brightness from `a` to `b`, if that is asked for."""
@@ -335,7 +316,8 @@ class FlowCorrespondence:
     def _started(self, a: FlowFrame, b: FlowFrame, start: Array | None, fine: bool) -> Array:
         """Dense flow a -> b from these targets; without, as the motion filter searches."""
         if start is not None:
-            return self._search(a, b, self._raster.dense(start, a), fine)
+            warped = fine and self.options.warp
+            return self._search(a, b, self._raster.dense(start, a), fine, warped=warped)
         if a.bridged is None and b.bridged is None:
             return self._free(a, b)
         return self._search(a, b, None, fine)

@@ -45,8 +45,16 @@ class FlowOptions:
         default=3, metadata={"help": "variational refinement iterations", "ge": 0, "le": 20}
     )
     global_refinement: int = field(
-        default=1,
+        default=3,
         metadata={"help": "the same for global bundle adjustment", "ge": 0, "le": 20},
+    )
+    warp: bool = field(
+        default=True,
+        metadata={
+            "help": "global bundle adjustment searches the second picture as it looks through the "
+            "flow that poses and depths predict: patches move as one, and what is seen at a slant "
+            "does not (false: patches set out from that flow)"
+        },
     )
     fill_window: int = field(
         default=9,

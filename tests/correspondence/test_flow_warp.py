@@ -1,0 +1,68 @@
+"""Global adjustment searches the second picture as it looks through what geometry predicts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from droidw.testing.scenes import Scene, SceneSpec
+
+
+@pytest.fixture(scope="module")
+def room():
+    return Scene(SceneSpec(208, 160, 21, 30.0, 3, False, "orbit"))
+
+
+@pytest.fixture(scope="module")
+def pictures(frame, room):
+    """The first and the last: what is seen at a slant has become wider or narrower."""
+    grey = [room.render(k).image.astype(np.float32).mean(-1) for k in (0, 20)]
+    return [frame(k, picture) for k, picture in enumerate(grey)]
+
+
+@pytest.fixture(scope="module")
+def measured(operator, question, pictures, room):
+    """`measured(off, purpose, **options)`: targets, px, true ones, and where they are known.
+
+    Predicted is the truth, `off` pixels to the right.
+    """
+
+    def call(off=0.0, purpose="global", **options):
+        part = operator(**options)
+        asked = replace(question(part, pictures), informed=True)
+        truth = room.correspond(0, 20, asked.payload(0).centres.astype(np.float64))
+        there = np.nan_to_num(truth.target) + np.array([off, 0.0])
+        coords = (there - part.offset) / part.stride
+        asked = replace(asked, coords=torch.from_numpy(coords.astype(np.float32))[None])
+        found = part.session(purpose).update(asked)
+        target = found.target[0].numpy() * part.stride + part.offset
+        known = truth.visible & (found.confidence[0, ..., :2].numpy().min(-1) > 0.3)
+        assert known.mean() > 0.3
+        return target, truth.target, known
+
+    return call
+
+
+def error(targets):
+    """Median distance from the truth, px."""
+    target, truth, known = targets
+    return float(np.median(np.linalg.norm(target - truth, axis=-1)[known]))
+
+
+def test_matches_are_more_exact_than_from_a_start_alone(measured):
+    assert error(measured()) < 0.7 * error(measured(warp=False))
+
+
+def test_a_wrong_prediction_is_not_confirmed(measured):
+    right, _, known = measured()
+    wrong, _, also = measured(off=1.0)
+    moved = float(np.median((wrong - right)[known & also][:, 0]))
+    assert abs(moved) < 0.05  # of the pixel by which it was off
+
+
+def test_the_window_sets_out_as_it_did(measured):
+    both = [measured(purpose="window", warp=warp)[0] for warp in (True, False)]
+    assert np.array_equal(*both)
