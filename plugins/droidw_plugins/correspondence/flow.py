@@ -45,7 +45,7 @@ class FlowOptions:
         default=3, metadata={"help": "variational refinement iterations", "ge": 0, "le": 20}
     )
     global_refinement: int = field(
-        default=3,
+        default=1,
         metadata={"help": "the same for global bundle adjustment", "ge": 0, "le": 20},
     )
     warp: bool = field(
