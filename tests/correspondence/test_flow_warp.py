@@ -56,6 +56,13 @@ def test_matches_are_more_exact_than_from_a_start_alone(measured):
     assert error(measured()) < 0.7 * error(measured(warp=False))
 
 
+def test_they_are_not_all_off_in_one_way(measured):
+    target, truth, known = measured()
+    off = target - truth
+    near = known & (np.linalg.norm(off, axis=-1) < 0.5)
+    assert np.linalg.norm(off[near].mean(axis=0)) < 0.02
+
+
 def test_a_wrong_prediction_is_not_confirmed(measured):
     right, _, known = measured()
     wrong, _, also = measured(off=1.0)

@@ -55,8 +55,8 @@ class DenseSearch:
         A patch of the search moves as one. Where the camera goes forward, or passes a floor, each
         of its pixels moves by an amount of its own, and the patch is off by what its structure is
         beside its middle. Once that is taken out they all move alike, and little. What is left is
-        the mean of a patch, and goes with the mean of what was expected there: in the middle of a
-        cell, where an edge is bent between cells, it would count what was expected beside it twice.
+        the mean over a patch, and goes with the mean of what was expected over it: with what was
+        expected in the middle alone, matches would fall short where flow bends between cells.
 
         Args:
             expected: [H,W,2] pixels.
