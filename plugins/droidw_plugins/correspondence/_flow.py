@@ -317,7 +317,8 @@ class FlowCorrespondence:
         """Dense flow a -> b from these targets; without, as the motion filter searches."""
         if start is not None:
             warped = fine and self.options.warp
-            return self._search(a, b, self._raster.dense(start, a), fine, warped=warped)
+            expected = self._raster.dense(start, a, settled=warped)
+            return self._search(a, b, expected, fine, warped=warped)
         if a.bridged is None and b.bridged is None:
             return self._free(a, b)
         return self._search(a, b, None, fine)

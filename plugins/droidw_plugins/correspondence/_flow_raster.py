@@ -14,6 +14,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Raster"]
 
+# Pixels by which a cell moves otherwise than those around it, from which on its depth is taken to
+# be wrong: seen through that, all around it would be torn.
+_STRAY = 2.0
+
 
 class Raster:
     """Where the pixels of pictures lie on the grid; made once for each size.
@@ -27,9 +31,15 @@ class Raster:
         self._placed: tuple[tuple[int, int], Any, Any] | None = None
         self._pixels: Array | None = None
 
-    def dense(self, target: Array, a: FlowFrame) -> Array:
-        """Grid targets [h,w,2] in cells as a full flow field [H,W,2] in pixels."""
+    def dense(self, target: Array, a: FlowFrame, settled: bool = False) -> Array:
+        """Grid targets [h,w,2] in cells as a full flow field [H,W,2] in pixels.
+
+        Args:
+            settled: cells that stray from those around them go with them.
+        """
         flow = target * self._stride + self._offset - a.centres
+        if settled:
+            flow = _settled(flow)
         height, width = a.grey.shape
         map_x, map_y = self._maps(height, width)
         dense = cv2.remap(
@@ -55,3 +65,12 @@ class Raster:
             cols = np.float32(np.clip((np.arange(width) - self._offset) / self._stride, 0, None))
             self._placed = ((height, width), *np.meshgrid(cols, rows))
         return self._placed[1], self._placed[2]
+
+
+def _settled(flow: Array) -> Array:
+    """Displacements [h,w,2], pixels; what strays from the median of its 3x3 becomes that median."""
+    parts = [np.ascontiguousarray(part, dtype=np.float32) for part in np.moveaxis(flow, -1, 0)]
+    median: Any = np.stack([cv2.medianBlur(part, 3) for part in parts], axis=-1)
+    strays = np.abs(flow - median).max(axis=-1, keepdims=True) > _STRAY
+    settled: Array = np.where(strays, median, flow)
+    return settled

@@ -62,14 +62,21 @@ class DenseSearch:
             expected: [H,W,2] pixels.
         """
         pixels = self._raster.pixels(*a.shape)
+        # OpenCV's cubic interpolation displaces a picture by up to a twentieth of a pixel.
         there = pixels + expected
         seen: Any = cv2.remap(
-            b, there[..., 0], there[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+            b, there[..., 0], there[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
         )
         rest = self(a, seen, None, fine=fine, near=False)
-        mean: Any = cv2.GaussianBlur(expected, (0, 0), _PATCH * self._options.patch_size)
+        size = self._options.patch_size << self._scale(fine)
+        mean: Any = cv2.GaussianBlur(
+            expected, (0, 0), _PATCH * size, borderType=cv2.BORDER_REPLICATE
+        )
         flow: Array = rest + sample(mean, pixels + rest)
         return flow
+
+    def _scale(self, fine: bool) -> int:
+        return self._options.global_scale if fine else self._options.finest_scale
 
     def _engine(self, kind: str, fine: bool, shape: tuple[int, ...]) -> Any:
         """The one for this use on this thread.
@@ -78,7 +85,7 @@ class DenseSearch:
         one for all uses the result would depend on which thread did what before.
         """
         options = self._options
-        scale = options.global_scale if fine else options.finest_scale
+        scale = self._scale(fine)
         refinement = options.global_refinement if fine else options.refinement
         name = f"{kind}-{scale}-{refinement}"
         engine: Any = getattr(self._local, name, None)
