@@ -30,7 +30,8 @@ Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 
 # Median distance of two starts, in cells, that lead to the same result: a search goes on from the
-# coarsest level, where a pixel is little.
+# coarsest level, where a pixel is little, and of what is off in a flow that it looks through a
+# hundredth is left.
 _SAME_START = 0.15
 # Power of the picture along the strongest edge of a cell from which on a match cannot slip there,
 # (grey levels per pixel)^2, and of any place, as a share of that across it: a point on a line may

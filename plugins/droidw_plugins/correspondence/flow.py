@@ -219,7 +219,7 @@ def _build(options: Any, context: BuildContext) -> Correspondence:
 
 COMPONENT: Component[Correspondence] = Component(
     name="flow",
-    summary="dense inverse search optical flow both ways, started from the predicted flow",
+    summary="dense inverse search optical flow both ways, guided by the predicted flow",
     factory=_build,
     options=FlowOptions,
     requires=("cv2",),
