@@ -13,8 +13,9 @@ from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 
 CPU = ("--preset", "cpu", "ba=torch", "frontend.predict=velocity")
 # One search: a second one rests on cells that a threshold picks, and rounding picks others. Nor is
-# there an exposure to take out, for up to half of a hundredth is none.
-FLOW = (*CPU, "correspondence.options.bridge=0", "correspondence.options.exposure=false")
+# there an exposure to take out, for up to half of a hundredth is none, nor is a picture resampled,
+# for that is done at whole 32nds of a pixel.
+FLOW = (*CPU, "correspondence.options={bridge: 0, exposure: false, warp: false}")
 DROID = (
     "--preset", "droid-slam", "ba=torch",
     "correspondence.options={precision: float32, store: float}",
