@@ -96,6 +96,7 @@ def test_cells_of_a_wrong_depth_tear_nothing(measured):
 
 
 def test_a_wrong_prediction_is_not_confirmed(measured):
+    """Nor was it by patches that set out from it: what they kept must not come back."""
     right, _, known = measured()
     wrong, _, also = measured(off=1.0)
     moved = float(np.median((wrong - right)[known & also][:, 0]))

@@ -62,8 +62,8 @@ class DenseSearch:
             expected: [H,W,2] pixels.
         """
         pixels = self._raster.pixels(*a.shape)
-        # OpenCV's cubic interpolation displaces a picture by up to a twentieth of a pixel.
         there = pixels + expected
+        # OpenCV's cubic interpolation displaces a picture by up to a twentieth of a pixel.
         seen: Any = cv2.remap(
             b, there[..., 0], there[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
         )
