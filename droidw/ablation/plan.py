@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from droidw.config.load import Source, packaged_configs, read_yaml
+from droidw.config.load import Source, read_yaml
+from droidw.config.packaged import packaged_configs, packaged_in
 from droidw.errors import ConfigError, UsageError
 from droidw.plugin.registry import nearest
 
@@ -145,14 +146,13 @@ def _find(file: str) -> Path:
     path = Path(file)
     if path.is_file() or path.suffix in (".yaml", ".yml"):
         return path
-    packaged = packaged_configs()
-    if f"ablations/{file}" in packaged:
-        return packaged[f"ablations/{file}"]
-    names = [name.partition("/")[2] for name in packaged if name.startswith("ablations/")]
-    near = nearest(file, names)
+    packaged = packaged_in("ablations")
+    if file in packaged:
+        return packaged[file]
+    near = nearest(file, packaged)
     raise UsageError(
         f"'{file}' is neither a file nor an ablation that comes with droidw",
-        (f"did you mean '{near}'?   " if near else "") + f"available: {', '.join(names)}",
+        (f"did you mean '{near}'?   " if near else "") + f"available: {', '.join(packaged)}",
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from droidw.cli.options import add_plugin_arguments, plugins_from
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["HELP", "add_arguments", "main"]
 
+# Name of a preset -> configuration.
+_Presets = Mapping[str, Mapping[str, Any]]
+
 HELP = "list the parts that plugins offer, whether they can run here, and their options"
 
 
@@ -26,7 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--from", dest="distribution", metavar="DIST", help="only parts of this distribution"
     )
     parser.add_argument(
-        "--options", metavar="NAME", help="the options of one part: type, default, meaning"
+        "--options",
+        metavar="NAME",
+        help="the options of one part: type, default, what presets set, meaning",
     )
     parser.add_argument(
         "--traceback", metavar="NAME", help="why the plugin of this name failed to load, in full"
@@ -50,14 +56,16 @@ def main(args: argparse.Namespace) -> int:
     if args.options:
         entries = _named(plugins, args.options, args.kind)
         if args.json:
-            print(as_json([_facts(plugins, entry) for entry in entries]))
+            presets = _presets()
+            print(as_json([_facts(plugins, entry, presets) for entry in entries]))
         else:
             print("\n\n".join(_options(plugins, entry) for entry in entries))
         return 0
     entries = _selected(plugins, args.kind, args.distribution)
     if args.json:
         failures = [dataclasses.asdict(failure) for failure in plugins.failures]
-        facts = [_facts(plugins, entry) for entry in entries]
+        presets = _presets()
+        facts = [_facts(plugins, entry, presets) for entry in entries]
         print(as_json({"plugins": facts, "failures": failures}))
     else:
         print(_listing(plugins, entries))
@@ -148,10 +156,26 @@ def _named(plugins: Plugins, name: str, kind: str | None) -> list[Entry]:
     )
 
 
-def _option_rows(entry: Entry) -> list[dict[str, str]]:
+def _option_rows(entry: Entry, presets: _Presets) -> list[dict[str, Any]]:
+    """Options as described; `presets` holds the values of those that presets set."""
     from droidw.config.describe import rows
 
-    return [dataclasses.asdict(row) for row in rows(entry.component.options)]
+    found: list[dict[str, Any]] = [dataclasses.asdict(row) for row in rows(entry.component.options)]
+    for preset, slots in presets.items():
+        slot = slots.get(entry.kind, {})
+        chosen = slot["options"] if slot.get("name") == entry.component.name else {}
+        for option in found:
+            if option["key"] in chosen:
+                option.setdefault("presets", {})[preset] = chosen[option["key"]]
+    return found
+
+
+def _presets() -> _Presets:
+    """Which parts the presets that come with droidw choose, and with what options."""
+    from droidw.config.load import load_config
+    from droidw.config.packaged import packaged_in
+
+    return {name: load_config(preset=name).data for name in packaged_in("presets")}
 
 
 def _key(entry: Entry) -> str:
@@ -172,18 +196,20 @@ def _options(plugins: Plugins, entry: Entry) -> str:
     ]
     if component.reference:
         text.append(paragraph(f"  {component.reference}", indent=2))
-    options = _option_rows(entry)
+    options = _option_rows(entry, _presets())
     if not options:
         return "\n".join([*text, "  it has no options"])
-    rows = [("option", "type", "default", "range", "meaning")]
+    said = [", ".join(f"{p}: {v}" for p, v in o.get("presets", {}).items()) for o in options]
+    shown = any(said)  # a column for what presets set, if they set anything
+    rows = [("option", "type", "default", *["in presets"] * shown, "range", "meaning")]
     rows += [
-        (f"{_key(entry)}.{o['key']}", o["type"], o["default"], o["limits"], o["help"])
-        for o in options
+        (f"{_key(entry)}.{o['key']}", o["type"], o["default"], *[v] * shown, o["limits"], o["help"])
+        for o, v in zip(options, said, strict=True)
     ]
     return "\n".join([*text, "", table(rows, indent=2)])
 
 
-def _facts(plugins: Plugins, entry: Entry) -> dict[str, Any]:
+def _facts(plugins: Plugins, entry: Entry, presets: _Presets) -> dict[str, Any]:
     component = entry.component
     return {
         "kind": entry.kind,
@@ -200,7 +226,7 @@ def _facts(plugins: Plugins, entry: Entry) -> dict[str, Any]:
         "capabilities": sorted(component.capabilities),
         "reference": component.reference,
         "options_key": _key(entry),
-        "options": _option_rows(entry),
+        "options": _option_rows(entry, presets),
     }
 
 

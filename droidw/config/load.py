@@ -11,12 +11,12 @@ import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from droidw.config.packaged import packaged_configs, packaged_in
 from droidw.config.schema import DroidwConfig
 from droidw.errors import ConfigError, UsageError
 from droidw.plugin.registry import SLOTS, nearest
@@ -27,7 +27,6 @@ __all__ = [
     "Source",
     "load_config",
     "override_layers",
-    "packaged_configs",
     "read_yaml",
 ]
 
@@ -135,25 +134,6 @@ def override_layers(
     """
     said = [*trees, *(_nested(*_override(text)) for text in overrides)]
     return [(_COMMAND_LINE, tree) for tree in sorted(said, key=lambda tree: not _chooses(tree))]
-
-
-def packaged_configs() -> dict[str, Path]:
-    """Files that come with droidw, by the name that `extends` takes: "base", "presets/cpu".
-
-    Raises:
-        ConfigError: droidw is not installed, so they cannot be found.
-    """
-    try:
-        root = Path(str(resources.files("droidw.configs")))
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            "droidw runs from a bare source tree, so its presets are not found",
-            "install it: pip install -e .",
-        ) from error
-    return {
-        path.relative_to(root).with_suffix("").as_posix(): path
-        for path in sorted(root.rglob("*.yaml"))
-    }
 
 
 class _Merger:
@@ -301,14 +281,13 @@ def _nested(path: Sequence[str], value: Any) -> _Tree:
 def _preset_path(preset: str) -> Path:
     if preset.endswith((".yaml", ".yml")):
         return Path(preset)
-    packaged = packaged_configs()
-    if f"presets/{preset}" in packaged:
-        return packaged[f"presets/{preset}"]
-    names = [name.partition("/")[2] for name in packaged if name.startswith("presets/")]
-    near = nearest(preset, names)
+    presets = packaged_in("presets")
+    if preset in presets:
+        return presets[preset]
+    near = nearest(preset, presets)
     raise UsageError(
         f"--preset: no preset is called '{preset}'",
-        (f"did you mean '{near}'?   " if near else "") + f"presets: {', '.join(names)}, auto",
+        (f"did you mean '{near}'?   " if near else "") + f"presets: {', '.join(presets)}, auto",
     )
 
 

@@ -17,7 +17,8 @@ import yaml
 
 from droidw.config.check import check_keys, check_ranges, typed
 from droidw.config.inert import check_inert
-from droidw.config.load import LISTED, LoadedConfig, Source, load_config, packaged_configs
+from droidw.config.load import LISTED, LoadedConfig, Source, load_config
+from droidw.config.packaged import packaged_in
 from droidw.config.schema import DroidwConfig
 from droidw.errors import ConfigError, DroidwError, MissingRequirementError, PluginError
 from droidw.plugin.component import Component
@@ -173,7 +174,7 @@ def needs_preset(files: Sequence[str | Path]) -> bool:
         ConfigError: as `load_config`.
     """
     loaded = load_config(files)
-    presets = {p.resolve() for n, p in packaged_configs().items() if n.startswith("presets/")}
+    presets = {path.resolve() for path in packaged_in("presets").values()}
     sections = {key.partition(".")[0] for key in loaded.sources}
     read = {Path(file).resolve() for file in loaded.files}
     return presets.isdisjoint(read) and not sections >= set(loaded.data)

@@ -9,7 +9,8 @@ import yaml
 
 from droidw.ablation.cells import make_cells
 from droidw.ablation.plan import load_plan
-from droidw.config.load import load_config, packaged_configs
+from droidw.config.load import load_config
+from droidw.config.packaged import packaged_in
 from droidw.errors import ConfigError, InputError, MissingRequirementError, UsageError
 from droidw.plugin.registry import PluginNotFound
 
@@ -266,9 +267,7 @@ def test_every_published_row_is_a_row_of_paper():
     assert load_plan("paper").preset == "paper"
 
 
-@pytest.mark.parametrize(
-    "name", [n.partition("/")[2] for n in packaged_configs() if n.startswith("ablations/")]
-)
+@pytest.mark.parametrize("name", packaged_in("ablations"))
 def test_packaged_ablations_resolve(name, plugins, tmp_path):
     """Every row names plugins and options that exist, whether or not they can run here."""
     found = load_plan(name, data=tmp_path)

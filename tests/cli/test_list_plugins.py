@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from droidw.cli.main import main
+from droidw.config.load import load_config
 
 DATA = Path(__file__).resolve().parents[1] / "plugins" / "data"
 
@@ -69,6 +70,19 @@ def test_options(run, acme):
     (line,) = [line for line in text.splitlines() if "features.options.scale" in line]
     assert line.split() == ["features.options.scale", "number", "1.0", ">", "0", "factor", "on",
                             "all", "features"]  # fmt: skip
+
+
+def test_options_that_presets_set(run):
+    chosen = load_config(preset="cpu").data["uncertainty"]["options"]
+    header, *lines = run("--options", "affine-softplus").splitlines()[4:]
+    said = slice(header.index("in presets"), header.index("range"))
+    values = {line.split()[0].removeprefix("uncertainty.options."): line[said] for line in lines}
+    assert chosen.keys() < values.keys()
+    for key, value in values.items():
+        assert value.strip() == (f"cpu: {chosen[key]}" if key in chosen else "")
+    assert "in presets" not in run("--options", "per-pixel")
+    (part,) = json.loads(run("--json", "--options", "affine-softplus"))
+    assert {o["key"]: o["presets"]["cpu"] for o in part["options"] if "presets" in o} == chosen
 
 
 def test_options_of_a_name_of_several_kinds(run):

@@ -6,7 +6,8 @@ import dataclasses
 
 import pytest
 
-from droidw.config.load import load_config, packaged_configs
+from droidw.config.load import load_config
+from droidw.config.packaged import packaged_configs
 from droidw.config.schema import DroidwConfig
 from droidw.errors import ConfigError, UsageError
 

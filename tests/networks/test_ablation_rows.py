@@ -13,7 +13,7 @@ import pytest
 from droidw.ablation.cells import make_cells
 from droidw.ablation.plan import load_plan
 from droidw.ablation.run import Means, run_ablation
-from droidw.config.load import packaged_configs
+from droidw.config.packaged import packaged_in
 from droidw.io.tum import read_tum
 from droidw.plugin.manager import load_plugins
 from droidw.testing.scenes import Scene, SceneSpec
@@ -43,9 +43,7 @@ def clip(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [n.partition("/")[2] for n in packaged_configs() if n.startswith("ablations/")]
-)
+@pytest.mark.parametrize("name", packaged_in("ablations"))
 def test_every_row_runs(name, clip, tmp_path, monkeypatch):
     monkeypatch.setenv("DROIDW_WEIGHTS", str(write_made_up(tmp_path / "weights", NETWORKS)))
     plan = load_plan(name, data=clip.parent, sequences=[clip.name], seeds=[0])
