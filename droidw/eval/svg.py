@@ -75,13 +75,21 @@ def line_chart(
     y_label: str,
     size: tuple[int, int] = (760, 300),
 ) -> str:
-    """Lines over a common x axis; y starts at 0 if nothing is below."""
+    """Lines over a common x axis; y starts at 0 if nothing is below.
+
+    Where the middle of one line is twenty times that of another, y is logarithmic.
+    """
     width, height = size
     box = (_MARGIN, 34.0, width - 14.0, height - 44.0)
     x_low, x_high = _span([line.x for line in lines])
     y_low, y_high = _span([line.y for line in lines])
-    y_low = min(0.0, y_low)
-    frame = _Frame(box, (x_low, x_high), (y_low, y_high * 1.05 if y_high > 0 else y_high + 1.0))
+    middles = [
+        float(np.median(y)) for y in (line.y[np.isfinite(line.y)] for line in lines) if len(y)
+    ]
+    log = y_low >= 0 and _far_apart(middles)
+    y_low = min(middles) / 10 if log else min(0.0, y_low)
+    up = (y_low, y_high * 1.05 if y_high > 0 else y_high + 1.0)
+    frame = _Frame(box, (x_low, x_high), up, log)
     body = [_text(box[0], 20, title, weight=True), frame.axes(x_label, y_label)]
     body += [frame.line(line) for line in lines]
     body.append(_legend([(line.name, line.colour) for line in lines], box[2], 20))
@@ -122,12 +130,18 @@ def path_panels(
 def bar_chart(
     title: str, groups: Sequence[str], bars: Sequence[Bars], y_label: str, width: int = 960
 ) -> str:
-    """Groups of bars with their spread as a whisker and single values as dots."""
+    """Groups of bars with their spread as a whisker and single values as dots.
+
+    Where one is twenty times another, heights are logarithmic: else all but the largest look alike.
+    """
     height = 320
     box = (_MARGIN, 34.0 + 18.0 * math.ceil(len(bars) / 6), width - 14.0, height - 34.0)
     tops = [v + (s or 0.0) for b in bars for v, s in _with_spread(b) if v is not None]
     tops += [single for b in bars for one in b.singles for single in one]
-    frame = _Frame(box, (0.0, float(len(groups))), (0.0, max(tops, default=1.0) * 1.08 or 1.0))
+    known = [v for b in bars for v in b.values if v is not None]
+    log = _far_apart(known)
+    up = (min(known) / 2 if log else 0.0, max(tops, default=1.0) * 1.08 or 1.0)
+    frame = _Frame(box, (0.0, float(len(groups))), up, log)
     body = [_text(box[0], 20, title, weight=True), frame.axes("", y_label, across=False)]
     share = 0.84 / max(len(bars), 1)
     for g, group in enumerate(groups):
@@ -141,6 +155,11 @@ def bar_chart(
     return document("".join(body), width, height, title)
 
 
+def _far_apart(values: Sequence[float]) -> bool:
+    """Whether these are all positive, and one is twenty times another."""
+    return len(values) > 1 and min(values) > 0 and max(values) > 20 * min(values)
+
+
 def _with_spread(bar: Bars) -> list[tuple[float | None, float | None]]:
     spreads = list(bar.spreads) or [None] * len(bar.values)
     return list(zip(bar.values, spreads, strict=True))
@@ -149,9 +168,9 @@ def _with_spread(bar: Bars) -> list[tuple[float | None, float | None]]:
 def _bar(frame: _Frame, bar: Bars, group: int, left: float, share: float, fill: str) -> str:
     value, spread = _with_spread(bar)[group]
     if value is None:
-        return _text(frame.x(left + share / 2), frame.y(0.0) - 4, "-", "middle")
+        return _text(frame.x(left + share / 2), frame.box[3] - 4, "-", "middle")
     x0, x1 = frame.x(left), frame.x(left + 0.9 * share)
-    top, bottom = frame.y(value), frame.y(0.0)
+    top, bottom = frame.y(value), frame.box[3]
     label = escape(f"{bar.name}: {value:.4g}" + (f" ± {spread:.2g}" if spread else ""))
     parts = [
         f"<rect x='{x0:.1f}' y='{top:.1f}' width='{x1 - x0:.1f}' height='{bottom - top:.1f}' "
@@ -172,15 +191,19 @@ def _bar(frame: _Frame, bar: Bars, group: int, left: float, share: float, fill: 
 
 
 class _Frame:
-    """A box of the picture (left, top, right, bottom) that shows a range of x and y."""
+    """A box of the picture (left, top, right, bottom) that shows a range of x and y.
+
+    With `log` y is logarithmic, and what is below its range stands at its lower end.
+    """
 
     def __init__(
         self,
         box: tuple[float, float, float, float],
         across: tuple[float, float],
         up: tuple[float, float],
+        log: bool = False,
     ) -> None:
-        self.box, self.across, self.up = box, across, up
+        self.box, self.across, self.up, self.log = box, across, up, log
 
     def x(self, value: float) -> float:
         low, high = self.across
@@ -188,13 +211,15 @@ class _Frame:
 
     def y(self, value: float) -> float:
         low, high = self.up
+        if self.log:
+            low, high, value = (math.log10(v) for v in (low, high, max(value, low)))
         return self.box[3] - (value - low) / (high - low) * (self.box[3] - self.box[1])
 
     def axes(self, x_label: str, y_label: str, across: bool = True, few: bool = False) -> str:
         """Grid lines with their numbers, and the labels of the axes."""
         left, top, right, bottom = self.box
         parts = []
-        for value in _ticks(*self.up, 4 if few else 5):
+        for value in _powers(*self.up) if self.log else _ticks(*self.up, 4 if few else 5):
             y = self.y(value)
             parts.append(f"<path d='M{left:.1f} {y:.1f}H{right:.1f}' stroke='{_GREY}'/>")
             parts.append(_text(left - 6, y + 4, f"{value:.6g}", "end"))
@@ -244,6 +269,14 @@ def _ticks(low: float, high: float, count: int) -> list[float]:
     first = math.ceil(low / step - 1e-9)
     # Adding 0 turns -0 into 0.
     return [k * step + 0.0 for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def _powers(low: float, high: float) -> list[float]:
+    """1, 2 and 5 times the powers of ten within a range; of a wide one the powers alone."""
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    times = (1, 2, 5) if last - first <= 3 else (1,)
+    every = [float(f"{f}e{k}") for k in range(first, last + 1) for f in times]
+    return [value for value in every if low <= value <= high]
 
 
 def _span(values: Sequence[Array]) -> tuple[float, float]:

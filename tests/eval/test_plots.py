@@ -61,6 +61,25 @@ def test_bars() -> None:
     assert len(list(root.iter(f"{SVG}circle"))) == 2
 
 
+def test_bars_of_what_is_lost_leave_the_others_to_be_seen() -> None:
+    bars = [Bars("a", [0.5, 0.4]), Bars("b", [50.0, 0.6])]
+    root = ElementTree.fromstring(bar_chart("t", ["one", "two"], bars, "error"))
+    heights = [float(r.attrib["height"]) for r in root.iter(f"{SVG}rect") if len(r)]
+    decade = (heights[1] - heights[0]) / 2  # from 0.5 to 50
+    assert heights[0] > 10
+    assert heights[3] - heights[2] == pytest.approx(decade * np.log10(0.6 / 0.4), abs=0.2)
+    numbers = {text.text for text in root.iter(f"{SVG}text")}
+    assert {"0.2", "0.5", "1", "10", "50"} <= numbers
+
+
+def test_lines_of_what_is_lost_leave_the_others_to_be_seen() -> None:
+    x = np.arange(3.0)
+    lines = [Line("a", x, np.array([0.0, 1.0, 2.0]), "#111111"), Line("b", x, 100 * x, "#222222")]
+    (_, a), (_, b) = drawn(line_chart("t", lines, "x", "y"))
+    assert a[1, 1] - b[1, 1] == pytest.approx(a[2, 1] - b[2, 1], abs=0.2)  # both a hundred times
+    assert a[0, 1] == b[0, 1] == a[:, 1].max()  # none at all stands at the lower end
+
+
 @pytest.mark.parametrize("values", [[0.0, 0.0], [np.nan, np.nan], [5.0, 5.0], []])
 def test_nothing_to_show_is_shown(values: list[float]) -> None:
     y = np.array(values)
