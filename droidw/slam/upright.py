@@ -39,6 +39,9 @@ _log = logging.getLogger(__name__)
 
 # Share of the length of lines that must agree with the axes of a picture, for these to count.
 _KNOWN = 0.6
+# Share of all cells that are closed, from which lines that did not count are asked once more: where
+# nothing is hidden, all keyframes say what the first ones said.
+_HIDDEN = 0.05
 
 
 class Upright:
@@ -46,7 +49,8 @@ class Upright:
 
     Whether a scene has lines along three directions at right angles is decided when tracking
     begins, by the first keyframes: half of them must have `least_share` of the length of their
-    lines along these. Where it has not, nothing here does anything.
+    lines along these. It is decided anew before global adjustment, by all of them, when it is known
+    what moves. Where a scene has no such lines, nothing here does anything.
 
     Args:
         store: has the fields `axes` and `axes_information`.
@@ -73,8 +77,8 @@ class Upright:
         self._doubt = 1.0 if options is None else options.doubt
         self._gates = gates
         self._clock = clock
-        asked = self._find is not None and self._weight > 0
-        self.holds: bool | None = None if asked else False
+        self._asked = self._find is not None and self._weight > 0
+        self.holds: bool | None = None if self._asked else False
 
     def see(self, number: int) -> None:
         """Find the lines of a keyframe just appended, and turn it as they say."""
@@ -110,19 +114,42 @@ class Upright:
                     self.turn(number, still=True)
 
     def again(self) -> None:
-        """Measure the axes of all keyframes, by gates and focal length of now.
+        """Measure the axes of all keyframes, by gates and focal length of now, and decide anew.
 
         Where half of the keyframes no longer agree with theirs, lines do not count from then on.
+        What moves may have hidden lines from the first keyframes, and has edges of its own: where
+        half of all keyframes agree now, lines count from then on, and these are turned.
         """
+        held = bool(self.holds)
+        if not (held or (self._asked and self._much_is_hidden())):
+            return
+        self._complete()
+        self.holds = True
         share = self.measure()
-        if self.holds and share < self._least_share:
-            self.holds = False
-            _log.info(
-                "lines no longer count: %.0f %% of their length is along three directions at right "
-                "angles, and lines.least_share is %.2f",
-                100 * share,
-                self._least_share,
-            )
+        self.holds = share >= self._least_share
+        if self.holds == held:
+            return
+        _log.info(
+            "lines %s: %.0f %% of their length is along three directions at right angles, and "
+            "lines.least_share is %.2f",
+            "count from now on" if self.holds else "no longer count",
+            100 * share,
+            self._least_share,
+        )
+        for number in range(len(self._store)):
+            self.turn(number)
+
+    def _much_is_hidden(self) -> bool:
+        return bool((self._gates(0) < CLOSED).float().mean() >= _HIDDEN)
+
+    def _complete(self) -> None:
+        """Find the lines of keyframes that were not asked for them."""
+        if self._find is not None:
+            with self._clock("lines"):
+                for number, info in enumerate(self._store.infos):
+                    if info.lines is None:
+                        found = self._find(self._store.payload(number))
+                        info.lines = np.asarray(found, np.float32)
 
     def measure(self) -> float:
         """The same, and lines count as before.

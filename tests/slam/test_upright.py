@@ -185,22 +185,34 @@ def test_lines_that_lose_their_directions_count_no_longer(build, caplog):
     assert upright.term(store.T_cw, 0, 1.0) is None
 
 
-def test_nor_do_those_that_uncertainty_closes(build):
-    """In half of the picture lines stand askew; where it is closed the others decide."""
+def hidden(share):
+    """Gates with this share of each picture closed, at its left."""
+
+    def gates(first):
+        found = torch.ones(COUNT - first, GRID.height, GRID.width)
+        found[:, :, : round(share * GRID.width)] = 0.0
+        return found
+
+    return gates
+
+
+def half_askew():
+    """Lines along the axes in the right half of each picture, and of no direction in the left."""
     random = np.random.default_rng(2)
-    mixed = []
+    found = []
     for pose, other in zip(poses(), askew(seed=5), strict=True):
         good = lines_of(pose, random)
         good = good[good[:, [0, 2]].mean(axis=1) > 165]
         bad = other * (0.6, 1.0, 0.6, 1.0)
-        mixed.append(np.concatenate([good, bad[bad[:, [0, 2]].mean(axis=1) < 150]]))
+        found.append(np.concatenate([good, bad[bad[:, [0, 2]].mean(axis=1) < 150]]))
+    return found
 
-    def closed(first):
-        gates = torch.ones(COUNT - first, GRID.height, GRID.width)
-        gates[:, :, : GRID.width // 2] = 0.0
-        return gates
 
-    for gates, holds in ((None, False), (closed, True)):
+def test_nor_do_those_that_uncertainty_closes(build):
+    """In half of the picture lines stand askew; where it is closed the others decide."""
+    mixed = half_askew()
+
+    for gates, holds in ((None, False), (hidden(0.5), True)):
         upright, store, append, true = build(lines=mixed, gates=gates, least_share=0.9)
         for number in range(COUNT):
             append(number)
@@ -209,12 +221,49 @@ def test_nor_do_those_that_uncertainty_closes(build):
     assert float(apart(store.T_cw, true).max()) < 0.1
 
 
-@pytest.mark.parametrize("how", [{"weight": 0.0}, {"known": False}])
-def test_where_lines_are_not_asked_nothing_happens(build, how):
-    upright, store, append, _ = build(**how)
+def test_lines_count_once_what_hid_them_is_closed(build, caplog):
+    """In the left half stand edges of what moves; when tracking begins nobody knows that."""
+    mixed = half_askew()
+    known = {"gates": hidden(0.0)}
+    upright, store, append, true = build(
+        lines=mixed, gates=lambda first: known["gates"](first), least_share=0.9
+    )
+    for number in range(COUNT):
+        append(number)
+        if number == 3:
+            upright.begin()
+    assert upright.holds is False
+    assert store.infos[COUNT - 1].lines is None  # nobody asked since
+    upright.again()
+    assert upright.holds is False
+    known["gates"] = hidden(0.5)
+    with caplog.at_level(logging.INFO, "droidw"):
+        upright.again()
+    assert upright.holds
+    assert "count from now on" in caplog.text
+    assert float(apart(store.T_cw, true).max()) < 0.1
+
+
+@pytest.mark.parametrize(("share", "holds"), [(0.0, False), (0.5, True)])
+def test_lines_are_asked_once_more_where_something_is_hidden(build, share, holds):
+    upright, store, append, _ = build(lines=askew(), gates=hidden(share))
     for number in range(COUNT):
         append(number)
     upright.begin()
+    random = np.random.default_rng(0)
+    for info, pose in zip(store.infos, poses(), strict=True):
+        info.lines = lines_of(pose, random)
+    upright.again()
+    assert upright.holds is holds
+
+
+@pytest.mark.parametrize("how", [{"weight": 0.0}, {"known": False}])
+def test_where_lines_are_not_asked_nothing_happens(build, how):
+    upright, store, append, _ = build(gates=hidden(0.5), **how)
+    for number in range(COUNT):
+        append(number)
+    upright.begin()
+    upright.again()
     assert upright.holds is False
     assert store.infos[0].lines is None
     assert upright.term(store.T_cw, 0, 1.0) is None
