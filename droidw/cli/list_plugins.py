@@ -54,12 +54,11 @@ def main(args: argparse.Namespace) -> int:
         print(_traceback(plugins, args.traceback))
         return 0
     if args.options:
-        entries = _named(plugins, args.options, args.kind)
+        entries, presets = _named(plugins, args.options, args.kind), _presets()
         if args.json:
-            presets = _presets()
             print(as_json([_facts(plugins, entry, presets) for entry in entries]))
         else:
-            print("\n\n".join(_options(plugins, entry) for entry in entries))
+            print("\n\n".join(_options(plugins, entry, presets) for entry in entries))
         return 0
     entries = _selected(plugins, args.kind, args.distribution)
     if args.json:
@@ -185,7 +184,7 @@ def _key(entry: Entry) -> str:
     return f"{entry.kind}.options"
 
 
-def _options(plugins: Plugins, entry: Entry) -> str:
+def _options(plugins: Plugins, entry: Entry, presets: _Presets) -> str:
     from droidw.cli.render import paragraph, table
 
     component = entry.component
@@ -196,7 +195,7 @@ def _options(plugins: Plugins, entry: Entry) -> str:
     ]
     if component.reference:
         text.append(paragraph(f"  {component.reference}", indent=2))
-    options = _option_rows(entry, _presets())
+    options = _option_rows(entry, presets)
     if not options:
         return "\n".join([*text, "  it has no options"])
     said = [", ".join(f"{p}: {v}" for p, v in o.get("presets", {}).items()) for o in options]

@@ -17,7 +17,7 @@ from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 from droidw.slam.motion_filter import spans
 from droidw.slam.passes import all_passes
-from droidw.solve.weights import CLOSED
+from droidw.solve.weights import closed_share
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -154,7 +154,7 @@ class Backend:
 
     def _hidden(self) -> float:
         """Share of all cells that are closed, by uncertainty or a mask."""
-        return float((self.optimiser.gates() < CLOSED).float().mean())
+        return closed_share(self.optimiser.gates())
 
     def _upsample(self, session: EdgeSession, disps: Tensor) -> None:
         """Keep full-size maps where correspondence can make them."""

@@ -22,7 +22,7 @@ from droidw.solve.manhattan import (
     shared_axes,
 )
 from droidw.solve.planes import held_to_planes
-from droidw.solve.weights import CLOSED
+from droidw.solve.weights import CLOSED, closed_share
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -82,11 +82,11 @@ class Upright:
 
     def see(self, number: int) -> None:
         """Find the lines of a keyframe just appended, and turn it as they say."""
-        if self.holds is False or self._find is None:
+        if self.holds is False:
             return
         store = self._store
         with self._clock("lines"):
-            store.infos[number].lines = np.asarray(self._find(store.payload(number)), np.float32)
+            self._look(number)
             if self.holds is None:
                 return
             known = self._known()
@@ -121,9 +121,12 @@ class Upright:
         half of all keyframes agree now, lines count from then on, and these are turned.
         """
         held = bool(self.holds)
-        if not (held or (self._asked and self._much_is_hidden())):
+        if not (held or (self._asked and closed_share(self._gates(0)) >= _HIDDEN)):
             return
-        self._complete()
+        with self._clock("lines"):
+            for number, info in enumerate(self._store.infos):
+                if info.lines is None:  # nobody asked since lines did not count
+                    self._look(number)
         self.holds = True
         share = self.measure()
         self.holds = share >= self._least_share
@@ -136,20 +139,15 @@ class Upright:
             100 * share,
             self._least_share,
         )
-        for number in range(len(self._store)):
-            self.turn(number)
+        if self.holds:
+            for number in range(len(self._store)):
+                self.turn(number)
 
-    def _much_is_hidden(self) -> bool:
-        return bool((self._gates(0) < CLOSED).float().mean() >= _HIDDEN)
-
-    def _complete(self) -> None:
-        """Find the lines of keyframes that were not asked for them."""
+    def _look(self, number: int) -> None:
+        """Find the lines of a keyframe, where correspondence can."""
         if self._find is not None:
-            with self._clock("lines"):
-                for number, info in enumerate(self._store.infos):
-                    if info.lines is None:
-                        found = self._find(self._store.payload(number))
-                        info.lines = np.asarray(found, np.float32)
+            info = self._store.infos[number]
+            info.lines = np.asarray(self._find(self._store.payload(number)), np.float32)
 
     def measure(self) -> float:
         """The same, and lines count as before.

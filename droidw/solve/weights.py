@@ -24,6 +24,7 @@ __all__ = [
     "GateKind",
     "agreeing_share",
     "agreeing_weight",
+    "closed_share",
     "gate",
     "half_open",
     "opened",
@@ -226,6 +227,11 @@ def agreeing_weight(residual: Tensor, weight: Tensor, scale: float) -> Tensor:
         residual, weight, scale: as of `agreeing_share`.
     """
     return _agreeing(residual, weight, scale)[0]
+
+
+def closed_share(gates: Tensor) -> float:
+    """Share of all cells that are closed, by uncertainty or a mask."""
+    return float((gates < CLOSED).float().mean())
 
 
 def _agreeing(residual: Tensor, weight: Tensor, scale: float) -> tuple[Tensor, Tensor]:
