@@ -245,6 +245,14 @@ class BackendConfig:
         "many matches with a usual residual (0: not at all)",
         ge=0,
     )
+    seen_through: float = opt(
+        0.02,
+        "share of all cells that are open though later keyframes see nearer things where they seem "
+        "to be, as of what goes ahead of the camera, from which these are closed and all passes "
+        "made once more (1: never)",
+        ge=0,
+        le=1,
+    )
     learn: bool = opt(True, "let uncertainty learn anew after the first pass, from a mended path")
     relearn: bool = opt(True, "let uncertainty learn once more, from what was kept of the way back")
     turns: int = opt(

@@ -50,9 +50,10 @@ class KeyframeStore:
         T_cw [7] world to camera; disps [h,w] inverse depth; prior [h,w] inverse depth of the
         depth prior (0: none); features [c,h,w]; uncertainty [h,w]; damping [h,w] learned;
         unmasked [h,w] in [0,1], what the user's mask leaves of a cell and its neighbours; movable
-        [h,w] in [0,1], how likely features find what can move by itself (0: not asked); axes [3,3]
-        rotation from the axes of the scene to the camera, by the lines in the picture, and
-        axes_information [3,3] of a tangent vector on the left of it (0: not known), float64.
+        [h,w] in [0,1], how likely features find what can move by itself (0: not asked); through
+        [h,w] in [0,1], how much others see through a cell (0: not asked); axes [3,3] rotation from
+        the axes of the scene to the camera, by the lines in the picture, and axes_information [3,3]
+        of a tangent vector on the left of it (0: not known), float64.
 
     Args:
         grid: the grid on which maps live.
@@ -86,6 +87,7 @@ class KeyframeStore:
             StoreField("damping", ("h", "w"), fill=1e-6),
             StoreField("unmasked", ("h", "w"), fill=1.0),
             StoreField("movable", ("h", "w")),
+            StoreField("through", ("h", "w")),
             StoreField("axes", (3, 3), dtype="float64"),
             StoreField("axes_information", (3, 3), dtype="float64"),
         )

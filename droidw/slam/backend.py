@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 from droidw.slam.motion_filter import spans
 from droidw.slam.passes import all_passes
+from droidw.slam.seen_through import open_though_seen_through, seen_through
 from droidw.solve.weights import closed_share
 
 if TYPE_CHECKING:
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Backend"]
 
+_log = logging.getLogger(__name__)
+
 # Pairs whose distance is computed at once; bounds memory, not the result.
 _CHUNK = 2048
 
@@ -39,8 +43,8 @@ class Backend:
     Args:
         focal_known: the focal length is a calibration, not a guess.
         motion_prior: how much steady motion counts in the first pass, as `backend.motion_prior`.
-        learn: uncertainty learns anew after the first pass, as `backend.learn`.
         passes: to make; None: those of the configuration.
+        fresh: the path was just tracked: `backend.learn` and `backend.seen_through` count.
     Attributes:
         passes: those that `run` makes.
         focal: what the search for a better focal length found, None without one.
@@ -53,8 +57,8 @@ class Backend:
         config: DroidwConfig,
         focal_known: bool = True,
         motion_prior: float = 0.0,
-        learn: bool = False,
         passes: Sequence[Pass] | None = None,
+        fresh: bool = False,
     ) -> None:
         self.optimiser = optimiser
         self.config = config
@@ -62,7 +66,7 @@ class Backend:
         self.passes = all_passes(config.backend, wide) if passes is None else tuple(passes)
         self.focal_known = focal_known
         self.motion_prior = motion_prior
-        self.learn = learn
+        self.fresh = fresh
         self.focal: FocalSearch | None = None
         self.agreement = float("nan")
 
@@ -74,15 +78,50 @@ class Backend:
         Returns:
             The number of edges of the last pass, 0 if there was nothing to do.
         """
-        options, store = self.config.backend, self.optimiser.store
+        store = self.optimiser.store
         if len(store) < 3:
             return 0
+        given = store.intrinsics.clone(), store.image_intrinsics.clone()
+        graph = self._make(tell)
+        if graph is not None and self.fresh and self._sees_through(graph):
+            if self.focal is not None and self.focal.factor != 1.0:
+                # by what others see through, too
+                store.intrinsics.copy_(given[0])
+                store.image_intrinsics.copy_(given[1])
+                self.optimiser.upright.measure()
+            graph = self._make(tell)
+        return 0 if graph is None else len(graph)
+
+    def _sees_through(self, graph: FactorGraph) -> bool:
+        """Whether so much is open though others see through it, which is known from now on."""
+        store, gates = self.optimiser.store, self.optimiser.gates()
+        least = self.config.backend.seen_through
+        # Where no uncertainty is asked for, nothing is closed.
+        if least >= 1 or not bool(store["uncertainty"].any()):
+            return False
+        through = seen_through(store, graph, gates)
+        share = open_though_seen_through(through, gates)
+        if share < least:
+            return False
+        _log.info(
+            "%.0f %% of what is seen seems far away, but where the camera comes to later there is "
+            "something nearer: it moves ahead. Adjusting once more without it "
+            "(backend.seen_through=1 does not)",
+            100 * share,
+        )
+        store["through"].copy_(through)
+        return True
+
+    def _make(self, tell: Callable[[int, int], None]) -> FactorGraph | None:
+        """Make the passes, as of `run`; the graph of the last one."""
+        options, store = self.config.backend, self.optimiser.store
         row = self.config.schedule["global"]
         total = sum(part.updates for part in self.passes)
-        done = edges = 0
+        done = 0
+        graph = None
         anew = False
         for number, part in enumerate(self.passes):
-            learns = self.learn and part.learns
+            learns = self.fresh and options.learn and part.learns
             if learns and not anew:
                 self.optimiser.begin_anew()
                 anew = True
@@ -96,7 +135,7 @@ class Backend:
             more = part.kernel == "narrowest" and self._hidden() >= options.edges_hidden
             graph.add(self.edges(more))
             if len(graph) < 3:
-                return 0
+                return None
             session = self.optimiser.parts.correspondence.session("global")
             shown = store.disps
             for _ in range(part.updates):
@@ -113,7 +152,6 @@ class Backend:
                 )
                 done += 1
                 tell(done, total)
-            edges = len(graph)
             if part.refines and self.config.camera.refine_focal and len(store) >= MIN_KEYFRAMES:
                 self.focal = refine_focal(
                     self.optimiser,
@@ -127,7 +165,7 @@ class Backend:
                 self._upsample(session, shown)
                 gates = self.optimiser.gates()
                 self.agreement = explained_share(store, graph, graph.select(), gates)
-        return edges
+        return graph
 
     def _solver(self, kernel: Kernel) -> SolverConfig:
         """The solver of a pass with this kernel.

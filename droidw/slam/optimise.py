@@ -16,6 +16,7 @@ from droidw.geometry.projective import reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.interfaces.uncertainty import Indices, UncertaintyView
+from droidw.slam.seen_through import evidence
 from droidw.slam.upright import Upright
 from droidw.solve.epipolar import PointMatches, epipolar_term
 from droidw.solve.kernel import redescended, usual_square
@@ -230,13 +231,12 @@ class Optimiser:
         if not rows:
             return
         ii, jj = graph.index(rows)
-        at = on_device(rows, graph.target.device)
         pairs = [(graph.ii[r], graph.jj[r]) for r in rows]
         low = min(min(pair) for pair in pairs)
         used = _Edges(low, ii - low, jj - low, [(i - low, j - low) for i, j in pairs])
-        everything = len(rows) == len(graph)
-        target = graph.target if everything else graph.target[at]
-        confidence = graph.confidence if everything else graph.confidence[at]
+        whole = len(rows) == len(graph)
+        at = slice(None) if whole else on_device(rows, graph.target.device)
+        target, confidence = graph.target[at], graph.confidence[at]
         for _ in range(phase.iterations):
             with self.clock("bundle"):
                 self._step(used, target, confidence, phase, solver, first_free, motion_prior)
@@ -327,19 +327,19 @@ class Optimiser:
         What the user's masks leave, times what uncertainty leaves (if `learned`).
         """
         unmasked = self.store["unmasked"][first:]
-        if not learned:
-            return unmasked
-        return unmasked * self._gate(self.store["uncertainty"][first:])
+        return unmasked * self._gate_at(slice(first, None)) if learned else unmasked
 
     def learned_gates(self, nodes: Sequence[int]) -> Tensor:
         """What uncertainty alone leaves of these keyframes, [n,h,w] in [0,1]."""
-        return self._gate(self.store["uncertainty"][on_device(nodes, self.store.device)])
+        return self._gate_at(on_device(nodes, self.store.device))
 
-    def _gate(self, u: Tensor) -> Tensor:
+    def _gate_at(self, at: Tensor | slice) -> Tensor:
+        return self._gate(self.store["uncertainty"][at], self.store["through"][at])
+
+    def _gate(self, u: Tensor, through: Tensor) -> Tensor:
         w = self.weighting
-        u = opened(u / self._later, w.open_share, kind=w.gate, slope=w.slope, shift=w.shift)
-        below = w.closed_below if self.anew else 0.0
-        return gate(u, w.gate, w.slope, w.shift, w.floor, below)
+        u = opened(u / self._later + evidence(through), w.open_share, w.gate, w.slope, w.shift)
+        return gate(u, w.gate, w.slope, w.shift, w.floor, w.closed_below if self.anew else 0.0)
 
     def _part(self) -> None:
         """Let the gate close where what was learned parts in two, if that is later."""
@@ -378,7 +378,7 @@ class Optimiser:
             frames=on_device(list(frames), store.device),
             host=host,
             iteration=self.iterations,
-            gate=self._gate,
+            gate=lambda u: self._gate(u, store["through"]),
             calibrate=self._calibrate,
             mended=self.anew and not self.doubtful,
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from droidw.geometry.se3 import inv
 from droidw.slam.frame import KeyframeRecord
+from droidw.slam.seen_through import evidence
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -60,6 +61,7 @@ def keyframe_records(
     """
     T_wc = inv(store.T_cw.double()).cpu().numpy()
     intrinsics = store.image_intrinsics.double().cpu().numpy()
+    uncertainty = store["uncertainty"] + evidence(store["through"])
     return tuple(
         KeyframeRecord(
             index=info.index,
@@ -70,7 +72,7 @@ def keyframe_records(
             intrinsics=intrinsics,
             disp=store.disps[n].float().cpu().numpy().copy(),
             depth_valid=valid[n].cpu().numpy(),
-            uncertainty=store["uncertainty"][n].float().cpu().numpy().copy(),
+            uncertainty=uncertainty[n].float().cpu().numpy().copy(),
             weight=weight[n].float().cpu().numpy().copy(),
             disp_full=info.disp_full,
         )

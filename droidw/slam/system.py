@@ -290,8 +290,7 @@ class SlamSystem:
         elif not brief:
             with self.clock("global"):
                 self.optimiser.upright.again()
-                learn = self.config.backend.learn
-                backend = Backend(self.optimiser, self.config, self._focal_known, learn=learn)
+                backend = Backend(self.optimiser, self.config, self._focal_known, fresh=True)
                 backend.run(lambda done, total: self.events.emit(Progress("global", done, total)))
                 self._refined(backend.focal)
                 found = replace(found, agreement=backend.agreement)

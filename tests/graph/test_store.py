@@ -13,8 +13,8 @@ from droidw.interfaces.uncertainty import StoreField
 GRID = Grid(3, 4, 8, 3.5)
 EXTRA = (StoreField("own", (2, "h")), StoreField("count", (), fill=7, dtype="int64"))
 FIELDS = (
-    "T_cw", "disps", "prior", "features", "uncertainty", "damping", "unmasked", "movable", "own",
-    "count", "axes", "axes_information",
+    "T_cw", "disps", "prior", "features", "uncertainty", "damping", "unmasked", "movable",
+    "through", "own", "count", "axes", "axes_information",
 )  # fmt: skip
 
 

@@ -330,7 +330,7 @@ def test_uncertainty_learns_anew_when_the_path_is_mended(
 ):
     backend, _ = broken(**{"passes": [1, 1, 1, 1], **options})
     backend.config.schedule["global"].learn = in_all
-    backend.learn = learn
+    backend.fresh, backend.config.backend.learn = True, learn
     heard = []
     monkeypatch.setattr(
         backend.optimiser,
