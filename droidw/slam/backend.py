@@ -71,7 +71,7 @@ class Backend:
         self.agreement = float("nan")
 
     def run(self, tell: Callable[[int, int], None]) -> int:
-        """Make the passes.
+        """Make the passes; where much is seen through what seems far away, once more without that.
 
         Args:
             tell: called with (update steps done, update steps in all).
@@ -85,7 +85,7 @@ class Backend:
         graph = self._make(tell)
         if graph is not None and self.fresh and self._sees_through(graph):
             if self.focal is not None and self.focal.factor != 1.0:
-                # by what others see through, too
+                # What others see through had a say in it. It is looked for again.
                 store.intrinsics.copy_(given[0])
                 store.image_intrinsics.copy_(given[1])
                 self.optimiser.upright.measure()

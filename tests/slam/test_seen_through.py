@@ -17,6 +17,7 @@ from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.interfaces.uncertainty import UncertaintyReport
 from droidw.slam import seen_through as module
 from droidw.slam.backend import Backend
+from droidw.slam.focal import FocalSearch
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.records import keyframe_records
 from droidw.slam.seen_through import evidence, open_though_seen_through, seen_through
@@ -193,3 +194,22 @@ def test_nothing_is_made_once_more(backend, options) -> None:
     made.run(lambda done, total: None)
     assert len(asked) == 2
     assert not bool(made.optimiser.store["through"].any())
+
+
+def test_the_focal_length_is_looked_for_again_from_the_given_one(backend, monkeypatch) -> None:
+    made, _ = backend()
+    store = made.optimiser.store
+    given, started = store.image_intrinsics.clone(), []
+
+    def refine(*args):
+        started.append(store.image_intrinsics.clone())
+        for intrinsics in (store.intrinsics, store.image_intrinsics):
+            intrinsics[:2] *= 1.1
+        return FocalSearch(1.1, ())
+
+    monkeypatch.setattr("droidw.slam.backend.refine_focal", refine)
+    made.config.camera.refine_focal = True
+    made.run(lambda done, total: None)
+    assert [torch.equal(start, given) for start in started] == [True, True]
+    assert store.image_intrinsics[0] == pytest.approx(1.1 * float(given[0]))
+    assert store.intrinsics[0] == pytest.approx(1.1 * float(given[0]) / GRID.stride)
