@@ -74,9 +74,11 @@ def _length(path: Path6) -> float:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Write the clips."""
-    parser = argparse.ArgumentParser(description="Write clips of what drives ahead.")
-    parser.add_argument("out", type=Path, help="folder to write")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("out", type=Path, help="folder to write, not there yet")
     out = parser.parse_args(argv).out
+    if out.exists():
+        raise SystemExit(f"{out} is there already; name another folder")
     for name, drive in DRIVES.items():
         renderer = Renderer(replace(SCENES[drive.scene], build=behind(drive)), drive.seed)
         for of, moving in ((name, False), (f"{name}_moving", True)):
