@@ -249,7 +249,7 @@ class BackendConfig:
         0.02,
         "share of all cells that are open though later keyframes see nearer things where they seem "
         "to be, as of what goes ahead of the camera, from which these are closed and all passes "
-        "made once more (1: never)",
+        "made once more, but for a path of which less than `restart_below` agrees (1: never)",
         ge=0,
         le=1,
     )

@@ -18,7 +18,7 @@ from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 from droidw.slam.motion_filter import spans
 from droidw.slam.passes import all_passes
-from droidw.slam.seen_through import open_though_seen_through, seen_through
+from droidw.slam.seen_through import moves_ahead, open_though_seen_through
 from droidw.solve.weights import closed_share
 
 if TYPE_CHECKING:
@@ -95,19 +95,21 @@ class Backend:
     def _sees_through(self, graph: FactorGraph) -> bool:
         """Whether so much is open though others see through it, which is known from now on."""
         store, gates = self.optimiser.store, self.optimiser.gates()
-        least = self.config.backend.seen_through
-        # Where no uncertainty is asked for, nothing is closed.
-        if least >= 1 or not bool(store["uncertainty"].any()):
+        options = self.config.backend
+        # Where no uncertainty is asked for, nothing is closed. And a path in doubt may have all in
+        # the wrong place.
+        if options.seen_through >= 1 or not bool(store["uncertainty"].any()):
             return False
-        through = seen_through(store, graph, gates)
-        share = open_though_seen_through(through, gates)
-        if share < least:
+        if self.optimiser.upright.doubts(self.agreement, options.restart_below):
+            return False
+        through = moves_ahead(store, graph, gates, options.seen_through)
+        if through is None:
             return False
         _log.info(
             "%.0f %% of what is seen seems far away, but where the camera comes to later there is "
             "something nearer: it moves ahead. Adjusting once more without it "
             "(backend.seen_through=1 does not)",
-            100 * share,
+            100 * open_though_seen_through(through, gates),
         )
         store["through"].copy_(through)
         return True

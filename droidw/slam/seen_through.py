@@ -21,11 +21,14 @@ if TYPE_CHECKING:
     from droidw.graph.factors import FactorGraph
     from droidw.graph.store import KeyframeStore
 
-__all__ = ["evidence", "open_though_seen_through", "seen_through"]
+__all__ = ["evidence", "moves_ahead", "open_though_seen_through", "seen_through"]
 
 # A point lies before a cell if it is nearer than anything around it by this factor, and is what is
 # seen there within the other one.
 _BEFORE, _SAME = 1.25, 1.1
+# Of what moves ahead more than half is seen through by points three times as near, too; of what a
+# path that is off in scale has in the wrong place a fifth.
+_FAR_BEFORE, _MOST = 3.0, 0.4
 # So many points that are seen in the right place are supposed of every cell.
 _DOUBT = 2.0
 # What is left of it where a match leads to.
@@ -42,7 +45,26 @@ _MOST_VIEWS = 256
 _CHUNK = 512
 
 
-def seen_through(store: KeyframeStore, graph: FactorGraph, gates: Tensor) -> Tensor:
+def moves_ahead(
+    store: KeyframeStore, graph: FactorGraph, gates: Tensor, least: float
+) -> Tensor | None:
+    """What is seen through, [N,h,w], if that is because something moves ahead of the camera.
+
+    Args:
+        store, graph, gates: as of `seen_through`.
+        least: share of all cells that has to be open though others see through it.
+    """
+    through = seen_through(store, graph, gates)
+    share = open_though_seen_through(through, gates)
+    if share < least:
+        return None
+    far = seen_through(store, graph, gates, _FAR_BEFORE)
+    return through if open_though_seen_through(far, gates) >= _MOST * share else None
+
+
+def seen_through(
+    store: KeyframeStore, graph: FactorGraph, gates: Tensor, before: float = _BEFORE
+) -> Tensor:
     """How much each cell is seen through, [N,h,w] in [0,1].
 
     Of the well-known points of other keyframes that fall on a cell, the share that is nearer than
@@ -54,6 +76,7 @@ def seen_through(store: KeyframeStore, graph: FactorGraph, gates: Tensor) -> Ten
         store: poses and depths, once they are mended.
         graph: its active edges, with what was measured last.
         gates: [N,h,w] in [0,1]; closed cells say nothing of others.
+        before: how many times nearer a point has to be.
     """
     rows = graph.select()
     ii, jj = graph.index(rows)
@@ -62,7 +85,7 @@ def seen_through(store: KeyframeStore, graph: FactorGraph, gates: Tensor) -> Ten
     sure = torch.where(measured, confidence.amin(-1), 0.0)
     known = _known(torch.where(measured, confidence.sum(-1), 0.0), ii, len(store))
     good = (gates >= CLOSED) & (known >= 1.0)
-    share = _share_before(store, good) * known.clamp_max(1.0)
+    share = _share_before(store, good, before) * known.clamp_max(1.0)
     share = F.avg_pool2d(share[:, None], 3, 1, 1, count_include_pad=False)[:, 0]
     return _carried_on(share, ii, jj, torch.where(measured[..., None], target, 0.0), sure)
 
@@ -92,8 +115,12 @@ def _known(measured: Tensor, ii: Tensor, count: int) -> Tensor:
     return total / usual.clamp_min(1e-9)[:, None, None]
 
 
-def _share_before(store: KeyframeStore, good: Tensor) -> Tensor:
-    """Share of the good points of all other keyframes that pass before a cell, [N,h,w]."""
+def _share_before(store: KeyframeStore, good: Tensor, times: float) -> Tensor:
+    """Share of the good points of all other keyframes that pass before a cell, [N,h,w].
+
+    Args:
+        good: bool [N,h,w]. times: nearer than the cell.
+    """
     count, height, width = good.shape
     cells, device = height * width, good.device
     largest = F.max_pool2d(store.disps[:, None], 3, 1, 1).flatten()
@@ -112,7 +139,7 @@ def _share_before(store: KeyframeStore, good: Tensor) -> Tensor:
         at = ((jj[:, None, None] * height + y) * width + x)[falls]
         disp = depth[falls].reciprocal()
         near, far = largest[at], least[at]
-        before.index_add_(0, at, (disp > _BEFORE * near).float())
+        before.index_add_(0, at, (disp > times * near).float())
         same.index_add_(0, at, ((disp < _SAME * near) & (disp > far / _SAME)).float())
     return (before / (before + same + _DOUBT)).view(good.shape)
 

@@ -20,7 +20,12 @@ from droidw.slam.backend import Backend
 from droidw.slam.focal import FocalSearch
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.records import keyframe_records
-from droidw.slam.seen_through import evidence, open_though_seen_through, seen_through
+from droidw.slam.seen_through import (
+    evidence,
+    moves_ahead,
+    open_though_seen_through,
+    seen_through,
+)
 from droidw.slam.timing import Stopwatch
 from droidw.solve.weights import CLOSED, gate
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
@@ -63,6 +68,19 @@ def test_what_goes_ahead_is_seen_through_and_what_stands_is_not(ahead) -> None:
     around = torch.ones_like(through, dtype=torch.bool)
     around[:4, 2:11, 3:13] = False
     assert float(evidence(through[around]).max()) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("away", "least", "moves"), [(5, 0.02, True), (5, 0.5, False), (2, 0.02, False)]
+)
+def test_what_is_far_off_moves_ahead_and_what_is_a_little_off_does_not(
+    ahead, away, least, moves
+) -> None:
+    store, graph, gates = ahead(away=WALL / away)
+    through = seen_through(store, graph, gates)
+    assert open_though_seen_through(through, gates) > 0.02
+    found = moves_ahead(store, graph, gates, least)
+    assert torch.equal(found, through) if moves else found is None
 
 
 def test_something_near_that_stands_is_not(ahead) -> None:
@@ -186,8 +204,14 @@ def test_what_is_seen_through_is_closed_and_the_passes_made_once_more(backend, c
 
 @pytest.mark.parametrize(
     "options",
-    [{"fresh": False}, {"uncertain": 0.0}, {"seen_through": 1.0}, {"seen_through": 0.5}],
-    ids=["second look", "no uncertainty", "never", "not so much"],
+    [
+        {"fresh": False},
+        {"uncertain": 0.0},
+        {"seen_through": 1.0},
+        {"seen_through": 0.5},
+        {"restart_below": 1.0},
+    ],
+    ids=["second look", "no uncertainty", "never", "not so much", "in doubt"],
 )
 def test_nothing_is_made_once_more(backend, options) -> None:
     made, asked = backend(**options)
