@@ -94,14 +94,14 @@ class Backend:
 
     def _sees_through(self, graph: FactorGraph) -> bool:
         """Whether so much is open though others see through it, which is known from now on."""
-        store, gates = self.optimiser.store, self.optimiser.gates()
-        options = self.config.backend
+        store, options = self.optimiser.store, self.config.backend
         # Where no uncertainty is asked for, nothing is closed. And a path in doubt may have all in
         # the wrong place.
         if options.seen_through >= 1 or not bool(store["uncertainty"].any()):
             return False
         if self.optimiser.upright.doubts(self.agreement, options.restart_below):
             return False
+        gates = self.optimiser.gates()
         through = moves_ahead(store, graph, gates, options.seen_through)
         if through is None:
             return False

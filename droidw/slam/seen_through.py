@@ -1,4 +1,4 @@
-"""What keyframes see through: cells behind which, as it seems, others see something nearer.
+"""What keyframes see through: cells before which, as it seems, others see something.
 
 What goes ahead of a camera at a steady distance looks like something far away, with matches, poses
 and depths that agree. But when the camera comes to where it was there is a road, nearer than what
@@ -135,7 +135,7 @@ def _share_before(store: KeyframeStore, good: Tensor, times: float) -> Tensor:
         depth = depth_there(store.T_cw, store.disps, store.intrinsics, ii, jj)
         x, y = coords.round().long().unbind(-1)
         inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-        falls = good[ii] & valid & (depth > 0) & inside
+        falls = good[ii] & valid & inside  # what is valid lies ahead
         at = ((jj[:, None, None] * height + y) * width + x)[falls]
         disp = depth[falls].reciprocal()
         near, far = largest[at], least[at]
