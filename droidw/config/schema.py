@@ -153,6 +153,14 @@ class FrontendConfig:
         ge=0,
         le=1,
     )
+    unknown_moves: float = opt(
+        0.15,
+        "share of the pictures found to move, though the classifier does not say that it can, from "
+        "which the footage is tracked once more without the rest: that may be the one thing that "
+        "moves. What agrees farther over the picture is kept (1: never)",
+        ge=0,
+        le=1,
+    )
 
 
 @dataclass

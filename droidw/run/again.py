@@ -2,29 +2,32 @@
 
 What moves pulls at the first searches of a run, before uncertainty has learned anything. Where the
 result does not hold together, the footage is tracked anew with pictures less what the first time
-was found to move.
+was found to move. And where much was found to move that nobody knows to, what was taken for the
+world may be the one thing that does: the footage is tracked anew without the rest.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from droidw.geometry.spread import closed
+from droidw.slam.doubt import scatter
 from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from droidw.config.schema import DroidwConfig
+    from droidw.config.schema import DroidwConfig, FrontendConfig
     from droidw.slam.records import Outcome
     from droidw.slam.system import SlamSystem
 
-__all__ = ["Hidden", "rejection", "second_time", "to_hide"]
+__all__ = ["Again", "Hidden", "again", "second_time"]
 
 _Mask = npt.NDArray[np.bool_]
 
@@ -32,6 +35,10 @@ _Mask = npt.NDArray[np.bool_]
 _FEW = 0.02
 # How much less than before may agree the second time, with other matches and other gates.
 _SLACK = 0.05
+# How many times farther what agrees with another world has to reach, to be taken for it.
+_FARTHER = 1.1
+# What can move by so much, as the classifier says, is known to.
+_KNOWN = 0.1
 
 
 class Hidden:
@@ -63,39 +70,92 @@ class Hidden:
         return mask if mask.any() else None
 
 
-def to_hide(system: SlamSystem, outcome: Outcome, below: float) -> Hidden | None:
-    """What is to be hidden while the footage is tracked again.
+@dataclass(frozen=True)
+class Again:
+    """Why footage is tracked a second time, and without what.
+
+    Attributes:
+        hidden: of the pictures, while they are tracked.
+        turned: that is what was taken for the world; else what was found to move.
+        why: a sentence for the log.
+    """
+
+    hidden: Hidden
+    turned: bool
+    why: str
+
+    def rejection(self, first: Outcome, second: Outcome) -> str:
+        """Why what was found the second time is not to be kept; "" if it is."""
+        frames, before = len(second.trajectory), len(first.trajectory)
+        if frames < before:
+            return f"only {frames} of {before} frames could be read again"
+        if self.turned:
+            reach, other = _reach(first), _reach(second)
+            if not other >= _FARTHER * reach:
+                return f"it reaches over {other:.2f} of the picture, and the first over {reach:.2f}"
+            return ""
+        agreement = second.diagnosis.agreement
+        if not agreement >= first.diagnosis.agreement - _SLACK:
+            return f"{100 * agreement:.0f} % of what was measured agrees the second time"
+        return ""
+
+
+def again(system: SlamSystem, outcome: Outcome, options: FrontendConfig) -> Again | None:
+    """Whether the footage is to be tracked again.
 
     Args:
         system, outcome: of the first time.
-        below: agreement below which it is doubtful; 1 doubts all.
+        options: `again_below`, in doubt, and `unknown_moves`.
     Returns:
-        Where uncertainty leaves less than half; None where there is no doubt, or hardly anything
-        to hide. The user's masks are not in it: they hold anyway.
+        What to hide is where uncertainty leaves less than half, or at least that. None without a
+        reason, or where hardly anything is to be hidden. The user's masks are not in it: they hold
+        anyway.
     """
-    if not system.optimiser.upright.doubts(outcome.diagnosis.agreement, below):
+    store, agreement = system.store, outcome.diagnosis.agreement
+    gates = system.optimiser.learned_gates(range(len(store))).float()
+    shut = gates < CLOSED
+    if system.optimiser.upright.doubts(agreement, options.again_below):
+        turned, weights = False, gates
+        why = (
+            f"{100 * agreement:.0f} % of what was measured agrees with poses and depths: tracking "
+            "once more, without what was found to move (frontend.again_below=0 does not)"
+        )
+    elif outcome.diagnosis.still:
         return None
-    store, grid = system.store, system.grid
-    size = (system.camera.width, system.camera.height)
-    gates = system.optimiser.learned_gates(range(len(store))).float().cpu().numpy()
+    else:
+        unknown = float((shut & (store["movable"] < _KNOWN)).float().mean())
+        if not unknown > options.unknown_moves:
+            return None
+        turned, weights = True, shut.float()
+        why = (
+            f"{100 * unknown:.0f} % of the pictures was found to move though nobody knows it to, "
+            "and may be what stands still: tracking once more, without the rest "
+            "(frontend.unknown_moves=1 does not)"
+        )
+    grid, size = system.grid, (system.camera.width, system.camera.height)
     hidden = Hidden(
         [info.index for info in store.infos],
-        [closed(gate, grid.stride, grid.offset, size, CLOSED) for gate in gates],
+        [
+            closed(weight, grid.stride, grid.offset, size, CLOSED)
+            for weight in weights.cpu().numpy()
+        ],
     )
-    return hidden if hidden.share >= _FEW else None
+    return Again(hidden, turned, why) if hidden.share >= _FEW else None
+
+
+def _reach(outcome: Outcome) -> float:
+    """Share of the pictures that is open and agrees, times the area that it scatters over.
+
+    What a camera moves against surrounds what moves by itself: as a share of that of a picture of
+    which all is open, so that it is above 1 where a mover is in the middle.
+    """
+    open_ = torch.stack([torch.from_numpy(k.weight >= CLOSED) for k in outcome.keyframes]).double()
+    where = open_.mean(0)
+    share = outcome.diagnosis.agreement * float(where.mean())
+    return share * scatter(where) / scatter(torch.ones_like(where))
 
 
 def second_time(config: DroidwConfig) -> DroidwConfig:
     """The configuration of the second time, which is the last."""
-    return replace(config, frontend=replace(config.frontend, again_below=0.0))
-
-
-def rejection(first: Outcome, second: Outcome) -> str:
-    """Why what was found the second time is not to be kept; "" if it is."""
-    frames, before = len(second.trajectory), len(first.trajectory)
-    if frames < before:
-        return f"only {frames} of {before} frames could be read again"
-    agreement = second.diagnosis.agreement
-    if not agreement >= first.diagnosis.agreement - _SLACK:
-        return f"{100 * agreement:.0f} % of what was measured agrees the second time"
-    return ""
+    frontend = replace(config.frontend, again_below=0.0, unknown_moves=1.0)
+    return replace(config, frontend=frontend)

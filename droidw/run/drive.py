@@ -24,7 +24,7 @@ from droidw.io.prefetch import prefetch
 from droidw.io.tum import write_tum
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
-from droidw.run.again import Hidden, rejection, second_time, to_hide
+from droidw.run.again import Again, Hidden, again, second_time
 from droidw.run.cameras import choose_camera, open_masks
 from droidw.run.folder import listed, prepare, withdraw
 from droidw.run.machine import run_device, settle
@@ -189,17 +189,17 @@ class _Run:
         if not system.frames:
             raise Interrupted("stopped by a signal before the first frame", self.stop.signum)
         outcome = system.finish(frames, brief=failure is not None or self.stop.signum > 0)
-        hidden = None
+        once_more = None
         if failure is None and not self.stop.signum:
-            hidden = to_hide(system, outcome, self.config.frontend.again_below)
+            once_more = again(system, outcome, self.config.frontend)
         self.setup = facts_of_setup(
             self.resolved, self.device, self.context.weights_dir, system.parts
         )
         # What it measured is not needed any more, and the second time needs the room.
         del system
-        if hidden is not None:
+        if once_more is not None:
             gc.collect()
-            outcome = self._again(outcome, hidden, build, frames)
+            outcome = self._again(outcome, once_more, build, frames)
         if outcome.focal is not None and outcome.focal.factor != 1.0:
             self.said += (
                 f"; focal length refined to {outcome.focal.factor:.3f} times that, "
@@ -240,22 +240,19 @@ class _Run:
     def _again(
         self,
         outcome: Outcome,
-        hidden: Hidden,
+        reason: Again,
         build: Callable[[Hidden | None], SlamSystem],
         frames: Callable[[], Generator[Frame, None, None]],
     ) -> Outcome:
-        """Track once more, as the outcome is doubtful; what was found stays if that fails."""
-        _log.info(
-            "%.0f %% of what was measured agrees with poses and depths: tracking once more, "
-            "without what was found to move (frontend.again_below=0 does not)",
-            100 * outcome.diagnosis.agreement,
-        )
+        """Track once more; what was found stays if that fails."""
+        _log.info(reason.why)
         self.sweeps = 2
         try:
-            second = build(hidden)
+            second = build(reason.hidden)
             stopped = self._track(second, frames) is not None or self.stop.signum > 0
             found = None if stopped else second.finish(frames)
-            why = "it did not come to an end" if found is None else rejection(outcome, found)
+            early = "it did not come to an end"
+            why = early if found is None else reason.rejection(outcome, found)
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the first is as good as it was
             found, why = None, str(error) or type(error).__name__
         if found is None or why:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from droidw.graph.factors import FactorGraph
     from droidw.graph.store import KeyframeStore
 
-__all__ = ["doubtful", "explained_reach", "explained_share", "explained_weight"]
+__all__ = ["doubtful", "explained_reach", "explained_share", "explained_weight", "scatter"]
 
 # Distance of measured and predicted place, in cells, at which they agree by half.
 _SCALE = 0.2
@@ -74,11 +74,11 @@ def explained_reach(
     agreeing = agreeing_weight(*_apart(store, graph, rows, gates), _SCALE).sum(0).double()
     total = matched.sum(0).double()
     share = float(agreeing.sum() / total.sum().clamp_min(1e-6))
-    around = _scatter(total)
-    return share * min(1.0, _scatter(agreeing) / around) if around > 0 else 0.0
+    around = scatter(total)
+    return share * min(1.0, scatter(agreeing) / around) if around > 0 else 0.0
 
 
-def _scatter(weight: Tensor) -> float:
+def scatter(weight: Tensor) -> float:
     """Area of the ellipse that weights [h,w] scatter in, up to a factor, in cells."""
     height, width = weight.shape
     place = pixel_grid(height, width, weight.dtype, weight.device).flatten(0, 1).T

@@ -1,4 +1,4 @@
-"""Doubtful footage is tracked a second time, without what the first time was found to move."""
+"""Footage is tracked a second time where that is doubtful, or what moves may be the world."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-from droidw.config.schema import DroidwConfig
+from droidw.config.schema import DroidwConfig, FrontendConfig
 from droidw.geometry.camera import Grid
-from droidw.run.again import Hidden, rejection, second_time, to_hide
+from droidw.run.again import Again, Hidden, again, second_time
 from droidw.run.drive import _Run
 from droidw.slam.backend import Backend
 from droidw.slam.diagnosis import Diagnosis
@@ -22,17 +22,39 @@ from droidw.slam.doubt import doubtful
 from droidw.slam.filler import Filler
 from droidw.slam.system import SlamSystem
 
-LEARNED = ("features=cnn", "uncertainty=affine-softplus", "threads=1")
+LEARNED = (
+    "features=cnn", "uncertainty=affine-softplus", "threads=1", "frontend.unknown_moves=1",
+)  # fmt: skip
 AGAIN = (*LEARNED, "frontend.again_below=1")
 
 
-def outcome(agreement, frames=30):
-    diagnosis = Diagnosis(frames, 3, still=False, lost=0.0, agreement=agreement)
-    return SimpleNamespace(diagnosis=diagnosis, trajectory=range(frames))
+def outcome(agreement, frames=30, open_=1.0, still=False):
+    """What tracking came to; so much of its only keyframe is open, from the left."""
+    diagnosis = Diagnosis(frames, 3, still=still, lost=0.0, agreement=agreement)
+    weight = np.zeros((10, 20), np.float32)
+    weight[:, : int(20 * open_)] = 1.0
+    record = SimpleNamespace(weight=weight)
+    return SimpleNamespace(diagnosis=diagnosis, trajectory=range(frames), keyframes=(record,))
+
+
+def to_hide(system, outcome, below):
+    """What is hidden for doubt."""
+    found = again(system, outcome, FrontendConfig(again_below=below, unknown_moves=1.0))
+    assert found is None or not found.turned
+    return found and found.hidden
+
+
+def rejection(first, second, turned=False):
+    return Again(Hidden([], []), turned, "").rejection(first, second)
 
 
 class Store(list):
-    """Infos of keyframes, as a store has them."""
+    """Infos of keyframes, as a store has them, and what can move."""
+
+    movable = torch.zeros(3, 12, 16)
+
+    def __getitem__(self, name):
+        return getattr(self, name)
 
     @property
     def infos(self):
@@ -109,10 +131,62 @@ def test_the_second_outcome_stays_unless_it_agrees_much_less_or_is_shorter():
     assert "18 of 26 frames" in rejection(outcome(0.60, 26), outcome(0.70, 18))
 
 
+def turned(system, above, known=0.0, still=False):
+    """What is tracked again because so much moves that nobody knows to."""
+    system.store.movable = torch.full((3, 12, 16), known)
+    return again(system, outcome(0.9, still=still), FrontendConfig(unknown_moves=above))
+
+
+def test_where_much_moves_that_nobody_knows_to_the_rest_is_hidden(first):
+    found = turned(first, above=0.3)  # a third of all cells is closed
+    assert found.turned
+    assert "33 %" in found.why and "frontend.unknown_moves" in found.why
+    for index in (4, 7):
+        assert not found.hidden(index)[:, :56].any()
+        assert found.hidden(index)[:, 72:].all()
+    assert found.hidden(9).all()
+
+
+def test_what_is_known_to_move_is_not_taken_for_the_world(first):
+    assert turned(first, above=0.3, known=0.2) is None
+    assert turned(first, above=0.4) is None
+    assert turned(first, above=1.0) is None
+
+
+def test_of_a_camera_at_rest_nothing_else_is_the_world(first):
+    assert turned(first, above=0.1, still=True) is None
+
+
+def test_doubt_comes_before_another_world(first):
+    found = again(first, outcome(0.5), FrontendConfig(again_below=0.7, unknown_moves=0.1))
+    assert not found.turned
+    assert "frontend.again_below" in found.why
+
+
+def test_another_world_has_to_reach_farther():
+    first = outcome(0.95, open_=0.5)
+    assert rejection(first, outcome(0.90, open_=0.7), turned=True) == ""
+    assert "0.08" in rejection(first, outcome(0.95, open_=0.3), turned=True)
+    assert rejection(first, outcome(0.6, open_=0.6), turned=True)
+    assert rejection(first, outcome(0.95, open_=0.5), turned=True)
+    assert rejection(first, outcome(float("nan"), open_=0.7), turned=True)
+    assert "18 of 30 frames" in rejection(first, outcome(0.9, 18, open_=0.7), turned=True)
+
+
+def test_what_surrounds_a_mover_reaches_farther_than_it():
+    around, inside = outcome(0.9), outcome(0.9)
+    around.keyframes[0].weight[3:7, 4:16] = 0.0  # a quarter of the picture, in its middle
+    inside.keyframes[0].weight[:] = 0.0
+    inside.keyframes[0].weight[2:8, 3:17] = 1.0
+    assert rejection(inside, around, turned=True) == ""
+    assert rejection(around, inside, turned=True)
+
+
 def test_there_is_no_third_time():
     config = DroidwConfig()
     second = second_time(config)
     assert second.frontend.again_below == 0.0
+    assert second.frontend.unknown_moves == 1.0
     assert config.frontend.again_below > 0.0
     assert second.backend is config.backend
 
@@ -215,6 +289,19 @@ def test_without_doubt_footage_is_tracked_once(go, footage, watched):
     ran = go(footage().folder, *LEARNED, "frontend.again_below=0")
     assert ran.code == 0, ran.err
     assert ran.manifest["sweeps"] == len(watched) == 1
+
+
+def test_footage_is_tracked_without_what_may_move_alone(go, footage, watched):
+    ran = go(footage().folder, *LEARNED, "frontend.unknown_moves=0.3")
+    assert ran.code == 0, ran.err
+    assert ran.manifest["sweeps"] == len(watched) == 2
+    one, two = watched
+    assert all(mask is None for mask in one.tracked)
+    for mask in two.tracked:
+        assert mask[:, 80:].all()  # what was open: `closing` shuts the left
+        assert not mask[:, :40].any()
+    assert all(mask is None for mask in two.adjusted + two.filled)
+    assert len(ran.poses) == 26
 
 
 def test_twice_gives_the_same_bytes(go, footage, watched):
