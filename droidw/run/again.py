@@ -107,21 +107,22 @@ def again(system: SlamSystem, outcome: Outcome, options: FrontendConfig) -> Agai
         system, outcome: of the first time.
         options: `again_below`, in doubt, and `unknown_moves`.
     Returns:
-        What to hide is where uncertainty leaves less than half, or at least that. None without a
-        reason, or where hardly anything is to be hidden. The user's masks are not in it: they hold
-        anyway.
+        What to hide is where uncertainty leaves less than half, or where it leaves more. None
+        without a reason, of a camera at rest, or where hardly anything is to be hidden. The user's
+        masks are not in it: they hold anyway.
     """
     store, agreement = system.store, outcome.diagnosis.agreement
+    doubt = system.optimiser.upright.doubts(agreement, options.again_below)
+    if not doubt and outcome.diagnosis.still:
+        return None
     gates = system.optimiser.learned_gates(range(len(store))).float()
     shut = gates < CLOSED
-    if system.optimiser.upright.doubts(agreement, options.again_below):
+    if doubt:
         turned, weights = False, gates
         why = (
             f"{100 * agreement:.0f} % of what was measured agrees with poses and depths: tracking "
             "once more, without what was found to move (frontend.again_below=0 does not)"
         )
-    elif outcome.diagnosis.still:
-        return None
     else:
         unknown = float((shut & (store["movable"] < _KNOWN)).float().mean())
         if not unknown > options.unknown_moves:
@@ -146,8 +147,8 @@ def again(system: SlamSystem, outcome: Outcome, options: FrontendConfig) -> Agai
 def _reach(outcome: Outcome) -> float:
     """Share of the pictures that is open and agrees, times the area that it scatters over.
 
-    What a camera moves against surrounds what moves by itself: as a share of that of a picture of
-    which all is open, so that it is above 1 where a mover is in the middle.
+    What a camera moves against surrounds what moves by itself. The area is in units of that of a
+    whole picture, and above 1 where what is closed lies in the middle.
     """
     open_ = torch.stack([torch.from_numpy(k.weight >= CLOSED) for k in outcome.keyframes]).double()
     where = open_.mean(0)

@@ -157,6 +157,12 @@ def test_of_a_camera_at_rest_nothing_else_is_the_world(first):
     assert turned(first, above=0.1, still=True) is None
 
 
+def test_without_a_keyframe_there_is_nothing_to_hide(first):
+    first.store.clear()
+    first.optimiser.learned_gates = None
+    assert again(first, outcome(float("nan"), still=True), FrontendConfig()) is None
+
+
 def test_doubt_comes_before_another_world(first):
     found = again(first, outcome(0.5), FrontendConfig(again_below=0.7, unknown_moves=0.1))
     assert not found.turned
