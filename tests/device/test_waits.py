@@ -13,7 +13,7 @@ from droidw.slam.system import SlamSystem
 from droidw.testing.pretend_gpu import PretendGpu
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 
-FLOW = ("--preset", "cpu", "ba=torch", "frontend.predict=velocity")
+FLOW = ("frontend.unknown_moves=1", "--preset", "cpu", "ba=torch", "frontend.predict=velocity")
 DROID = ("--preset", "droid-slam", "ba=torch", "uncertainty=affine-softplus", "features=fit3d",
          "schedule.window.learn=true", "schedule.window_kept.learn=true")  # fmt: skip
 WATCHED = {

@@ -11,7 +11,10 @@ from droidw.geometry.align import umeyama
 from droidw.slam import backwards as module
 from droidw.slam.backend import Backend
 
-DOUBT = ("backend.backwards_below=1", "features=cnn", "uncertainty=affine-softplus", "threads=1")
+DOUBT = (
+    "backend.backwards_below=1", "frontend.unknown_moves=1",
+    "features=cnn", "uncertainty=affine-softplus", "threads=1",
+)  # fmt: skip
 FILES = ("trajectory.tum", "keyframes.tum", "points.ply")
 
 
