@@ -113,10 +113,9 @@ def again(system: SlamSystem, outcome: Outcome, options: FrontendConfig) -> Agai
     """
     store, agreement = system.store, outcome.diagnosis.agreement
     doubt = system.optimiser.upright.doubts(agreement, options.again_below)
-    if not doubt and outcome.diagnosis.still:
+    if not doubt and (outcome.diagnosis.still or options.unknown_moves >= 1):
         return None
     gates = system.optimiser.learned_gates(range(len(store))).float()
-    shut = gates < CLOSED
     if doubt:
         turned, weights = False, gates
         why = (
@@ -124,6 +123,7 @@ def again(system: SlamSystem, outcome: Outcome, options: FrontendConfig) -> Agai
             "once more, without what was found to move (frontend.again_below=0 does not)"
         )
     else:
+        shut = gates < CLOSED
         unknown = float((shut & (store["movable"] < _KNOWN)).float().mean())
         if not unknown > options.unknown_moves:
             return None

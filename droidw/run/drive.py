@@ -251,8 +251,7 @@ class _Run:
             second = build(reason.hidden)
             stopped = self._track(second, frames) is not None or self.stop.signum > 0
             found = None if stopped else second.finish(frames)
-            early = "it did not come to an end"
-            why = early if found is None else reason.rejection(outcome, found)
+            why = reason.rejection(outcome, found) if found else "it did not come to an end"
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the first is as good as it was
             found, why = None, str(error) or type(error).__name__
         if found is None or why:
