@@ -17,7 +17,7 @@ import numpy.typing as npt
 import torch
 
 from droidw.geometry.spread import closed
-from droidw.slam.doubt import scatter
+from droidw.slam.doubt import explained_share, scatter
 from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
@@ -37,6 +37,8 @@ _FEW = 0.02
 _SLACK = 0.05
 # How many times farther what agrees with another world has to reach, to be taken for it.
 _FARTHER = 1.1
+# Share of what is seen that has to agree with another world while that is all that is seen.
+_FOOTING = 0.5
 # What can move by so much, as the classifier says, is known to.
 _KNOWN = 0.1
 
@@ -83,6 +85,21 @@ class Again:
     hidden: Hidden
     turned: bool
     why: str
+
+    def footless(self, second: SlamSystem) -> str:
+        """Why it is not worth the time to finish what has been tracked; "" if it is.
+
+        What does not hold together while it is all that is seen is no world.
+        """
+        if not self.turned:
+            return ""
+        store, graph, gates = second.store, second.frontend.graph, second.optimiser.gates()
+        agreement = explained_share(store, graph, list(range(len(graph))), gates)
+        seen = (store["unmasked"] >= CLOSED).float().sum()
+        share = agreement * float((gates >= CLOSED).float().sum() / seen.clamp_min(1))
+        if share >= _FOOTING:
+            return ""
+        return f"{100 * share:.0f} % of what was seen while tracking agrees"
 
     def rejection(self, first: Outcome, second: Outcome) -> str:
         """Why what was found the second time is not to be kept; "" if it is."""

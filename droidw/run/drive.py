@@ -250,8 +250,9 @@ class _Run:
         try:
             second = build(reason.hidden)
             stopped = self._track(second, frames) is not None or self.stop.signum > 0
-            found = None if stopped else second.finish(frames)
-            why = reason.rejection(outcome, found) if found else "it did not come to an end"
+            why = "it did not come to an end" if stopped else reason.footless(second)
+            found = None if why else second.finish(frames)
+            why = reason.rejection(outcome, found) if found else why
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the first is as good as it was
             found, why = None, str(error) or type(error).__name__
         if found is None or why:

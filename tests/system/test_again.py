@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from droidw.run.again import Again
 from droidw.run.drive import _Run
 from droidw.slam.backend import Backend
 from droidw.slam.filler import Filler
@@ -124,7 +125,7 @@ def test_without_doubt_footage_is_tracked_once(go, footage, watched):
 
 
 def test_footage_is_tracked_without_what_may_move_alone(go, footage, watched):
-    ran = go(footage().folder, *LEARNED, "frontend.unknown_moves=0.3")
+    ran = go(footage().folder, "threads=1", "frontend.unknown_moves=0.3")
     assert ran.code == 0, ran.err
     assert ran.manifest["sweeps"] == len(watched) == 2
     one, two = watched
@@ -133,6 +134,25 @@ def test_footage_is_tracked_without_what_may_move_alone(go, footage, watched):
         assert mask[:, 80:].all()  # what was open: `closing` shuts the left
         assert not mask[:, :40].any()
     assert all(mask is None for mask in two.adjusted + two.filled)
+    assert len(ran.poses) == 26
+
+
+def test_what_does_not_hold_together_while_tracked_goes_no_further(
+    go, footage, watched, monkeypatch
+):
+    real, asked = Again.footless, []
+
+    def footless(self, second):
+        asked.append(real(self, second))
+        return "it is a house of cards"
+
+    monkeypatch.setattr(Again, "footless", footless)
+    ran = go(footage().folder, "threads=1", "frontend.unknown_moves=0.3")
+    assert ran.code == 0, ran.err
+    assert asked == [""]
+    assert len(watched) == 1
+    assert (ran.manifest["sweeps"], ran.manifest["kept_sweep"]) == (2, 1)
+    assert "house of cards" in ran.warnings
     assert len(ran.poses) == 26
 
 

@@ -10,6 +10,8 @@ import torch
 
 from droidw.config.schema import DroidwConfig, FrontendConfig
 from droidw.geometry.camera import Grid
+from droidw.geometry.projective import reproject
+from droidw.graph.factors import FactorGraph
 from droidw.run.again import Again, Hidden, again, second_time
 from droidw.slam.diagnosis import Diagnosis
 from droidw.slam.doubt import doubtful
@@ -33,6 +35,13 @@ def to_hide(system, outcome, below):
 
 def rejection(first, second, turned=False):
     return Again(Hidden([], []), turned, "").rejection(first, second)
+
+
+class Known(SimpleNamespace):
+    """Fields that can be asked for by name, too."""
+
+    def __getitem__(self, name):
+        return getattr(self, name)
 
 
 class Store(list):
@@ -142,6 +151,50 @@ def test_what_is_known_to_move_is_not_taken_for_the_world(first):
 
 def test_of_a_camera_at_rest_nothing_else_is_the_world(first):
     assert turned(first, above=0.1, still=True) is None
+
+
+@pytest.fixture
+def second():
+    """What has been tracked of a plane by a camera that went aside; half of it is seen."""
+    store = Known(
+        T_cw=torch.tensor([[0.0, 0, 0, 0, 0, 0, 1], [-0.5, 0, 0, 0, 0, 0, 1]]),
+        disps=torch.ones(2, 10, 20),
+        unmasked=torch.zeros(2, 10, 20),
+        intrinsics=torch.tensor([16.0, 16, 10, 5]),
+    )
+    graph = FactorGraph(10, 20)
+    rows = graph.add([(0, 1)])
+    ahead, _ = reproject(store.T_cw, store.disps, store.intrinsics, *graph.index(rows))
+    graph.record(rows, ahead, torch.ones_like(ahead))
+    store.unmasked[:, :, 5:15] = 1.0
+    gates = store.unmasked.clone()
+    return SimpleNamespace(
+        store=store,
+        frontend=SimpleNamespace(graph=graph),
+        optimiser=SimpleNamespace(gates=lambda: gates),
+        gates=gates,
+    )
+
+
+def footless(system, turned=True):
+    return Again(Hidden([], []), turned, "").footless(system)
+
+
+def test_what_is_tracked_of_another_world_has_to_hold_together(second):
+    assert footless(second) == ""
+    second.frontend.graph.target += 3.0  # cells, from where its poses say
+    assert "0 % of what was seen" in footless(second)
+
+
+def test_another_world_that_uncertainty_closes_as_well_is_none(second):
+    second.gates[:, :, 7:] = 0.0
+    assert "20 % of what was seen" in footless(second)
+    assert footless(second, turned=False) == ""
+
+
+def test_another_world_of_which_nothing_is_seen_is_none(second):
+    second.store.unmasked[:] = second.gates[:] = 0.0
+    assert footless(second)
 
 
 def test_without_a_keyframe_there_is_nothing_to_hide(first):
