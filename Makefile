@@ -12,6 +12,8 @@
 export PYTHON
 ARGS ?=
 BIN := .venv/bin
+# A test has one thread (tests/conftest.py), so that cores can share them out; ARGS="-n 0" for one.
+PYTEST := $(BIN)/python -m pytest -n auto --maxprocesses 4 --dist worksteal
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test slow lint bench cuda-check clean
@@ -28,7 +30,7 @@ demo:
 
 test:
 	@.ci/setup test
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(PYTEST) $(ARGS)
 
 slow:
 	@.ci/setup test
