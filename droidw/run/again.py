@@ -38,7 +38,7 @@ _SLACK = 0.05
 # How many times farther what agrees with another world has to reach, to be taken for it.
 _FARTHER = 1.1
 # Share of what is seen that has to agree with another world while that is all that is seen.
-_FOOTING = 0.5
+_FOUNDED = 0.5
 # What can move by so much, as the classifier says, is known to.
 _KNOWN = 0.1
 
@@ -86,10 +86,13 @@ class Again:
     turned: bool
     why: str
 
-    def footless(self, second: SlamSystem) -> str:
+    def unfounded(self, second: SlamSystem) -> str:
         """Why it is not worth the time to finish what has been tracked; "" if it is.
 
         What does not hold together while it is all that is seen is no world.
+
+        Args:
+            second: has tracked all frames, with pictures less what is hidden.
         """
         if not self.turned:
             return ""
@@ -97,7 +100,7 @@ class Again:
         agreement = explained_share(store, graph, list(range(len(graph))), gates)
         seen = (store["unmasked"] >= CLOSED).float().sum()
         share = agreement * float((gates >= CLOSED).float().sum() / seen.clamp_min(1))
-        if share >= _FOOTING:
+        if share >= _FOUNDED:
             return ""
         return f"{100 * share:.0f} % of what was seen while tracking agrees"
 

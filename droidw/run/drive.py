@@ -250,7 +250,7 @@ class _Run:
         try:
             second = build(reason.hidden)
             stopped = self._track(second, frames) is not None or self.stop.signum > 0
-            why = "it did not come to an end" if stopped else reason.footless(second)
+            why = "it did not come to an end" if stopped else reason.unfounded(second)
             found = None if why else second.finish(frames)
             why = reason.rejection(outcome, found) if found else why
         except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - the first is as good as it was

@@ -140,13 +140,13 @@ def test_footage_is_tracked_without_what_may_move_alone(go, footage, watched):
 def test_what_does_not_hold_together_while_tracked_goes_no_further(
     go, footage, watched, monkeypatch
 ):
-    real, asked = Again.footless, []
+    real, asked = Again.unfounded, []
 
-    def footless(self, second):
+    def unfounded(self, second):
         asked.append(real(self, second))
         return "it is a house of cards"
 
-    monkeypatch.setattr(Again, "footless", footless)
+    monkeypatch.setattr(Again, "unfounded", unfounded)
     ran = go(footage().folder, "threads=1", "frontend.unknown_moves=0.3")
     assert ran.code == 0, ran.err
     assert asked == [""]

@@ -176,25 +176,25 @@ def second():
     )
 
 
-def footless(system, turned=True):
-    return Again(Hidden([], []), turned, "").footless(system)
+def unfounded(system, turned=True):
+    return Again(Hidden([], []), turned, "").unfounded(system)
 
 
 def test_what_is_tracked_of_another_world_has_to_hold_together(second):
-    assert footless(second) == ""
+    assert unfounded(second) == ""
     second.frontend.graph.target += 3.0  # cells, from where its poses say
-    assert "0 % of what was seen" in footless(second)
+    assert "0 % of what was seen" in unfounded(second)
 
 
 def test_another_world_that_uncertainty_closes_as_well_is_none(second):
     second.gates[:, :, 7:] = 0.0
-    assert "20 % of what was seen" in footless(second)
-    assert footless(second, turned=False) == ""
+    assert "20 % of what was seen" in unfounded(second)
+    assert unfounded(second, turned=False) == ""
 
 
 def test_another_world_of_which_nothing_is_seen_is_none(second):
     second.store.unmasked[:] = second.gates[:] = 0.0
-    assert footless(second)
+    assert unfounded(second)
 
 
 def test_without_a_keyframe_there_is_nothing_to_hide(first):
