@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Cell", "Outcome", "make_cells", "prepare", "read_outcome"]
 
+# Written in C where PyYAML has them: there is a configuration for every cell.
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
 _QUICK: Layer = (
     "ablation",
     {
@@ -131,8 +135,8 @@ def make_cells(
         for sequence, footage in plan.sequences.items():
             # Resolving takes a while, and sequences and seeds often differ in values alone.
             # But for what their dataset says of them.
-            named = footage.source if ":" in footage.source else ""
-            there = [str(_folder(data or data_root()))] if _in_a_dataset(named) else []
+            named = footage.source if _in_a_dataset(footage.source) else ""
+            there = [str(_folder(data or data_root()))] if named else []
             beside = "\n".join([*files, *there])
             same = json.dumps([row, footage.layer[1], footage.vary, named], default=str)
             if same not in known:
@@ -184,7 +188,7 @@ def _folder(data: Path) -> Path:
 
 def _with(text: str, values: Mapping[str, Any]) -> str:
     """A resolved configuration with other values of these full keys."""
-    tree = yaml.safe_load(text)
+    tree = yaml.load(text, Loader=_LOADER)
     for key, value in values.items():
         *path, last = key.split(".")
         part = tree
@@ -192,7 +196,8 @@ def _with(text: str, values: Mapping[str, Any]) -> str:
             part = part[name]
         part[last] = value
     head = [line for line in text.splitlines() if line.startswith("#")]
-    return "\n".join([*head, str(yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))])
+    body = yaml.dump(tree, Dumper=_DUMPER, sort_keys=False, allow_unicode=True)
+    return "\n".join([*head, str(body)])
 
 
 def _cell(row: str, sequence: str, resolved: ResolvedConfig, plan: Plan) -> Cell:
