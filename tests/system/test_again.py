@@ -137,6 +137,16 @@ def test_footage_is_tracked_without_what_may_move_alone(go, footage, watched):
     assert len(ran.poses) == 26
 
 
+def test_a_still_room_of_which_much_is_closed_stays_the_world(go, footage):
+    # The published step shuts half of it on these features, and then what is left the second time.
+    learned = "features=cnn", "uncertainty=affine-softplus", "backend.backwards_below=1"
+    ran = go(footage().folder, *learned, "threads=1")
+    assert ran.code == 0, ran.err
+    assert (ran.manifest["sweeps"], ran.manifest["kept_sweep"]) == (2, 1)
+    assert "of what was seen while tracking agrees" in ran.warnings
+    assert "could not be matched" not in ran.warnings
+
+
 def test_what_does_not_hold_together_while_tracked_goes_no_further(
     go, footage, watched, monkeypatch
 ):
