@@ -37,20 +37,21 @@ def rejection(first, second, turned=False):
     return Again(Hidden([], []), turned, "").rejection(first, second)
 
 
-class Known(SimpleNamespace):
+class Named:
     """Fields that can be asked for by name, too."""
 
     def __getitem__(self, name):
         return getattr(self, name)
 
 
-class Store(list):
+class Fields(Named, SimpleNamespace):
+    """What a store holds of all keyframes."""
+
+
+class Store(Named, list):
     """Infos of keyframes, as a store has them, and what can move."""
 
     movable = torch.zeros(3, 12, 16)
-
-    def __getitem__(self, name):
-        return getattr(self, name)
 
     @property
     def infos(self):
@@ -156,7 +157,7 @@ def test_of_a_camera_at_rest_nothing_else_is_the_world(first):
 @pytest.fixture
 def second():
     """What has been tracked of a plane by a camera that went aside; half of it is seen."""
-    store = Known(
+    store = Fields(
         T_cw=torch.tensor([[0.0, 0, 0, 0, 0, 0, 1], [-0.5, 0, 0, 0, 0, 0, 1]]),
         disps=torch.ones(2, 10, 20),
         unmasked=torch.zeros(2, 10, 20),
