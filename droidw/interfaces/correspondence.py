@@ -4,16 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias, runtime_checkable
 
 if TYPE_CHECKING:
+    import numpy.typing as npt
     from torch import Tensor
 
     from droidw.geometry.camera import Grid
     from droidw.slam.frame import Frame
 
-__all__ = ["Correspondence", "EdgeRequest", "EdgeSession", "EdgeUpdate", "Motion", "Purpose"]
+__all__ = [
+    "Correspondence",
+    "EdgeRequest",
+    "EdgeSession",
+    "EdgeUpdate",
+    "FindsLines",
+    "MatchesPoints",
+    "Motion",
+    "Purpose",
+    "SetsAside",
+    "Upsamples",
+]
 
+Array: TypeAlias = "npt.NDArray[Any]"
 Purpose = Literal["window", "global", "fill"]
 
 
@@ -85,11 +98,7 @@ class EdgeUpdate:
 
 @runtime_checkable
 class EdgeSession(Protocol):
-    """The state of the edges of one factor graph.
-
-    A session for "global" may besides have `upsample(node, disp) -> Tensor | None`: the map
-    [h,w] of a source frame of the last update at the full size [H,W] of the picture.
-    """
+    """The state of the edges of one factor graph; one for "global" may be one that `Upsamples`."""
 
     def update(self, request: EdgeRequest) -> EdgeUpdate:
         """One round: measure new edges, refine or re-use the old ones."""
@@ -101,6 +110,22 @@ class EdgeSession(Protocol):
 
 
 @runtime_checkable
+class Upsamples(Protocol):
+    """What a session may offer besides: maps at the full size of the picture."""
+
+    def upsample(self, node: int, disp: Tensor) -> Tensor | None:
+        """The map of a source frame of the last update, finer.
+
+        Args:
+            node: number of the frame.
+            disp: [h,w] inverse depth of its cells.
+        Returns:
+            [H,W]; None where nothing is known of how to make it.
+        """
+        ...
+
+
+@runtime_checkable
 class Correspondence(Protocol):
     """Measures dense correspondence on a regular grid of cells.
 
@@ -108,22 +133,8 @@ class Correspondence(Protocol):
     measures (`flow`) computes an edge once, and again when the prediction has moved away from
     where it started. Both are the same to the core.
 
-    It may besides have `matched_points(a, b, gate_a, gate_b) -> [n,4]`: points x, y of the picture
-    of payload `a` and where they lie in that of `b`, pixels of the working size, found without any
-    prediction and outside what the gates [h,w] (arrays in [0,1]) close. Where a path is in doubt,
-    they tell pieces of it that have settled in the wrong place (`backend.restarts`) and count in
-    what follows (`backend.points`), for which most of them must be right to a fifth of a pixel:
-    leave out what lies on a line.
-
-    And it may have `aside(payload, cells)`: the payload as one whose `cells`, bool [h,w], do not
-    tell how far a picture moved. It is only given to `motion`, as the reference, and what can move
-    by itself is set aside so. `matched` is then the share of the picture that the other cells of it
-    have, as under the user's mask, unless hardly any are left.
-
-    And it may have `line_segments(payload) -> [n,4]`: ends x, y, x, y of straight edges in the
-    picture, pixels of the working size. Where most of them are along three directions at right
-    angles they tell how the camera is turned (`lines.weight`), for which an end should be right to
-    a fifth of a pixel.
+    Besides it may be one that `MatchesPoints`, `SetsAside` or `FindsLines`; the core does without
+    what is not there.
 
     Attributes:
         stride, offset: the grid: cell (x, y) lies at pixel `stride * (x, y) + offset`.
@@ -166,4 +177,56 @@ class Correspondence(Protocol):
                 memory counts; "fill" for motion-only edges from keyframes to other frames,
                 each asked for in one direction.
         """
+        ...
+
+
+@runtime_checkable
+class MatchesPoints(Protocol):
+    """What correspondence may offer besides: points, found without any prediction.
+
+    Where a path is in doubt, they tell pieces of it that have settled in the wrong place
+    (`backend.restarts`) and count in what follows (`backend.points`), for which most of them must
+    be right to a fifth of a pixel: leave out what lies on a line.
+    """
+
+    def matched_points(self, a: Any, b: Any, gate_a: Array, gate_b: Array) -> Array:
+        """Points of one picture and where they lie in another, outside what gates close.
+
+        Args:
+            a, b: payloads.
+            gate_a, gate_b: [h,w] in [0,1], what is open of their cells.
+        Returns:
+            [n,4]: x, y in the picture of `a`, then in that of `b`, pixels of the working size.
+        """
+        ...
+
+
+@runtime_checkable
+class SetsAside(Protocol):
+    """What correspondence may offer besides: to ask how far a picture moved without some cells."""
+
+    def aside(self, payload: Any, cells: Tensor) -> Any:
+        """The payload as one whose cells do not tell how far a picture moved.
+
+        It is only given to `motion`, as the reference, and what can move by itself is set aside so.
+        `Motion.matched` is then the share of the picture that the other cells of it have, as under
+        the user's mask, unless hardly any are left.
+
+        Args:
+            payload: what `encode` returned.
+            cells: bool [h,w].
+        """
+        ...
+
+
+@runtime_checkable
+class FindsLines(Protocol):
+    """What correspondence may offer besides: straight edges in a picture.
+
+    Where most of them are along three directions at right angles they tell how the camera is turned
+    (`lines.weight`), for which an end should be right to a fifth of a pixel.
+    """
+
+    def line_segments(self, payload: Any) -> Array:
+        """[n,4]: ends x, y, x, y of straight edges, pixels of the working size."""
         ...

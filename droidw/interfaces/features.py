@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
     from droidw.geometry.camera import Grid
 
-__all__ = ["FeatureExtractor"]
+__all__ = ["FeatureExtractor", "KnowsMovable"]
 
 
 @runtime_checkable
@@ -26,10 +26,7 @@ class FeatureExtractor(Protocol):
     (at measured matches three quarters are above 0.895 and half above 0.93, docs/features.md).
     Uncertainty models then take it as it is; without it they bring it there themselves.
 
-    And it may have a method `movable(image, grid)`, with the arguments of `extract`: how much
-    speaks for it that a cell shows what can move by itself, [h,w] from 0 (nothing) to 1, such as a
-    person, an animal or a vehicle, whether it does or not. Uncertainty models may start from that;
-    nobody needs it.
+    And it may be one that `KnowsMovable`.
     """
 
     dim: int
@@ -42,5 +39,24 @@ class FeatureExtractor(Protocol):
             grid: where to sample; cell (x, y) lies at pixel `stride * (x, y) + offset`.
         Returns:
             [C,h,w] float32 or float16, finite, on the device of `image`; raw, not normalised.
+        """
+        ...
+
+
+@runtime_checkable
+class KnowsMovable(Protocol):
+    """What an extractor may offer besides: which cells show something that can move by itself.
+
+    Uncertainty models may start from that (`Begins`), and correspondence may leave it out where it
+    asks how far a picture moved (`SetsAside`); nobody needs it.
+    """
+
+    def movable(self, image: Tensor, grid: Grid) -> Tensor:
+        """How much speaks for a person, an animal or a vehicle, whether it moves or not.
+
+        Args:
+            image, grid: as of `FeatureExtractor.extract`.
+        Returns:
+            [h,w] float32 from 0 (nothing) to 1, on the device of `image`.
         """
         ...

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 if TYPE_CHECKING:
     from torch import Tensor
 
-__all__ = ["Indices", "StoreField", "UncertaintyModel", "UncertaintyReport", "UncertaintyView"]
+__all__ = [
+    "Begins",
+    "Indices",
+    "Renews",
+    "StoreField",
+    "UncertaintyModel",
+    "UncertaintyReport",
+    "UncertaintyView",
+]
 
 
 @dataclass(frozen=True)
@@ -100,14 +108,7 @@ class UncertaintyModel(Protocol):
     Attributes:
         fields: tensors that the model keeps per keyframe.
 
-    A model may also have `begins`, true if it wants to know what can move before any motion is
-    known. It then has a method `begin(view, movable)`, which writes `view.uncertainty` of
-    `view.frames` from what the extractor's `movable` says of them, [N,h,w]. It is called before the
-    first search, with the keyframes of the initialisation, and again in global adjustment, with all
-    of them: what was learned by then is given up. Only with such an extractor.
-    With `renews` it is told of every later keyframe, too: `renew(view, index, movable)`, with
-    `movable` [h,w] of keyframe `index` and without edges, is called just before its `append` and
-    writes no map.
+    One that `Begins`, and perhaps `Renews`, is told what can move before any motion is known.
     """
 
     fields: tuple[StoreField, ...]
@@ -129,4 +130,50 @@ class UncertaintyModel(Protocol):
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore `state_dict()`."""
+        ...
+
+
+@runtime_checkable
+class Begins(Protocol):
+    """What a model may offer besides: to start from what can move, before any motion is known.
+
+    It is asked only with an extractor that `KnowsMovable`.
+
+    Attributes:
+        begins: whether this model wants it.
+    """
+
+    begins: bool
+
+    def begin(self, view: UncertaintyView, movable: Tensor) -> None:
+        """Give up what was learned, and write `view.uncertainty` of `view.frames`.
+
+        Called before the first search, with the keyframes of the initialisation, and again in
+        global adjustment, with all of them.
+
+        Args:
+            view: without edges.
+            movable: [N,h,w] in [0,1], what the extractor's `movable` says of every keyframe.
+        """
+        ...
+
+
+@runtime_checkable
+class Renews(Protocol):
+    """What a model that `Begins` may offer besides: to be told of every later keyframe, too.
+
+    Attributes:
+        renews: whether this model wants it.
+    """
+
+    renews: bool
+
+    def renew(self, view: UncertaintyView, index: int, movable: Tensor) -> None:
+        """Take note of what can move in a keyframe, just before its `append`; writes no map.
+
+        Args:
+            view: without edges.
+            index: number of the keyframe.
+            movable: [h,w] in [0,1] of it.
+        """
         ...

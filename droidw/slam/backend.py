@@ -14,6 +14,7 @@ from droidw.geometry.projective import frame_distance
 from droidw.geometry.transfer import upload
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import backend_edges, frontend_edges
+from droidw.interfaces.correspondence import Upsamples
 from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 from droidw.slam.motion_filter import spans
@@ -198,11 +199,10 @@ class Backend:
 
     def _upsample(self, session: EdgeSession, disps: Tensor) -> None:
         """Keep full-size maps where correspondence can make them."""
-        upsample = getattr(session, "upsample", None)
-        if upsample is None:
+        if not isinstance(session, Upsamples):
             return
         for node, info in enumerate(self.optimiser.store.infos):
-            fine = upsample(node, disps[node])
+            fine = session.upsample(node, disps[node])
             if fine is not None:
                 info.disp_full = fine.float().cpu().numpy()
 

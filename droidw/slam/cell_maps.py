@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from droidw.geometry.transfer import upload
+from droidw.interfaces.features import KnowsMovable
 from droidw.solve.weights import unmasked
 
 if TYPE_CHECKING:
@@ -46,12 +47,14 @@ class CellMaps:
         with self._clock("features"):
             return self.parts.features.extract(upload(frame.image, self._device), self._picked)
 
-    def movable(self, frame: Frame) -> Tensor:
-        """[h,w] in [0,1], how much speaks for what can move; of an extractor that has `movable`."""
+    def movable(self, frame: Frame) -> Tensor | None:
+        """[h,w] in [0,1], how much speaks for what can move; None where nobody knows."""
+        extractor = self.parts.features
+        if not isinstance(extractor, KnowsMovable):
+            return None
         with self._clock("features"):
             image = upload(frame.image, self._device)
-            found: Tensor = self.parts.features.movable(image, self._picked)  # type: ignore[attr-defined]
-            return found
+            return extractor.movable(image, self._picked)
 
     def prior(self, frame: Frame) -> Tensor:
         """[h,w] inverse depth, 0 where it is not known."""

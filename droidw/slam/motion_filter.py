@@ -5,14 +5,14 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import torch
 
-from droidw.interfaces.correspondence import Motion
+from droidw.interfaces.correspondence import Motion, SetsAside
 from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
@@ -132,15 +132,16 @@ class MotionFilter:
         And the next keyframe comes nearer, as what is hidden, by that or by a mask, tells nothing.
 
         Args:
-            cells: bool [h,w], what may move; only of a correspondence that has `aside`. None:
+            cells: bool [h,w], what may move; only of a correspondence that `SetsAside`. None:
                 nothing. masked: bool [h,w]; None: nothing.
         """
         gone = [hidden.cpu() for hidden in (cells, masked) if hidden is not None]
         if gone:
             near = float(nearness(torch.stack(gone).any(dim=0), self._options))
             self._threshold = self._options.threshold * near
-        if cells is not None:
-            payload = self._correspondence.aside(current.payload, gone[0])  # type: ignore[attr-defined]
+        operator = self._correspondence
+        if cells is not None and isinstance(operator, SetsAside):
+            payload = operator.aside(current.payload, gone[0])
             self._reference = replace(current, payload=payload)
 
     def settled(self, index: int, kept: bool) -> None:
@@ -209,23 +210,21 @@ def spans(
 
 
 def look_ahead(
-    items: Iterable[T],
-    depth: int,
-    pool: ThreadPoolExecutor | None,
-    stop: Callable[[], None] = lambda: None,
+    items: Iterable[T], depth: int, stop: Callable[[], None] = lambda: None
 ) -> Iterator[T]:
     """Yield items in order, while a thread makes up to `depth` of those to come.
 
     Args:
-        items: made one after the other, in whichever thread.
-        pool: of one thread, or None to make each item when it is asked for.
+        items: made one after the other.
+        depth: 0: each is made when it is asked for, without a thread.
         stop: called when no more items are wanted, so that the thread waits for nothing.
     """
-    if pool is None:
+    if depth <= 0:
         yield from items
         return
     source = iter(items)
     waiting: deque[Future[T | None]] = deque()
+    pool = ThreadPoolExecutor(1, "ahead")
     try:
         while True:
             while len(waiting) <= depth:
@@ -238,5 +237,5 @@ def look_ahead(
         stop()
         # The source may not be closed while the thread is inside it.
         for future in waiting:
-            if not future.cancel():
-                wait([future])
+            future.cancel()
+        pool.shutdown(wait=True)

@@ -15,7 +15,8 @@ from torch import Tensor
 from droidw.geometry.projective import reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
-from droidw.interfaces.uncertainty import Indices, UncertaintyView
+from droidw.interfaces.features import KnowsMovable
+from droidw.interfaces.uncertainty import Begins, Indices, UncertaintyView
 from droidw.slam.seen_through import evidence
 from droidw.slam.upright import Upright
 from droidw.solve.epipolar import PointMatches, epipolar_term
@@ -103,14 +104,11 @@ class Optimiser:
         self._lines = lines
         self.upright = Upright(store, parts.correspondence, lines, self.gates, clock)
         self._published = published
-        self._calibrate = (
-            weighting.similarity == "matched"
-            and not published
-            and not getattr(parts.features, "calibrated", False)
-        )
-        self.begins = getattr(parts.uncertainty, "begins", False) and hasattr(
-            parts.features, "movable"
-        )
+        model, features = parts.uncertainty, parts.features
+        calibrated = published or getattr(features, "calibrated", False)
+        self._calibrate = weighting.similarity == "matched" and not calibrated
+        wanted = isinstance(model, Begins) and model.begins
+        self.begins = wanted and isinstance(features, KnowsMovable)
         self.begun = self.anew = self.doubtful = False
         self._later = 1.0
         self.points: tuple[PointMatches, float] | None = None
@@ -136,10 +134,11 @@ class Optimiser:
 
     def begin(self) -> None:
         """Let uncertainty start from what features say of the keyframes so far, if it wants to."""
-        if self.begins:
+        model = self.parts.uncertainty
+        if self.begins and isinstance(model, Begins):
             view = self.view(frames=range(len(self.store)))
             with self.clock("uncertainty"):
-                self.parts.uncertainty.begin(view, self.store["movable"])  # type: ignore[attr-defined]
+                model.begin(view, self.store["movable"])
             self.begun = True
 
     def begin_anew(self) -> None:

@@ -19,6 +19,7 @@ from droidw.geometry.projective import viewing_rays
 from droidw.geometry.se3 import chained, inv, mul
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import neighbour_edges
+from droidw.interfaces.correspondence import MatchesPoints
 from droidw.slam.backend import Backend
 from droidw.slam.path import Path
 from droidw.slam.splice import lead
@@ -65,16 +66,15 @@ def matched_points(optimiser: Optimiser) -> PointMatches | None:
     Returns:
         None where correspondence matches none.
     """
-    find = getattr(optimiser.parts.correspondence, "matched_points", None)
-    store = optimiser.store
-    if find is None or len(store) < _WINDOW:
+    operator, store = optimiser.parts.correspondence, optimiser.store
+    if not isinstance(operator, MatchesPoints) or len(store) < _WINDOW:
         return None
     gates = optimiser.gates().cpu().numpy()
     found, ends = [], []
     for i, j in neighbour_edges(len(store), _GAP):
         if i > j:
             continue
-        points = find(store.payload(i), store.payload(j), gates[i], gates[j])
+        points = operator.matched_points(store.payload(i), store.payload(j), gates[i], gates[j])
         found.append(np.asarray(points, np.float64).reshape(-1, 4))
         ends.append(np.tile((i, j), (len(points), 1)))
     at, end = torch.from_numpy(np.concatenate(found)), torch.from_numpy(np.concatenate(ends))

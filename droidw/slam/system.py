@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -17,6 +16,8 @@ from droidw.events import Dispatcher, FrameTracked, KeyframeAdded, KeyframeRemov
 from droidw.geometry.camera import Grid
 from droidw.geometry.se3 import inv
 from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.interfaces.correspondence import SetsAside
+from droidw.interfaces.uncertainty import Renews
 from droidw.slam.backend import Backend
 from droidw.slam.backwards import doubted
 from droidw.slam.cell_maps import CellMaps
@@ -116,11 +117,12 @@ class SlamSystem:
             config.lines,
         )
         self.frontend = Frontend(self.optimiser, config)
-        self._pool = ThreadPoolExecutor(1, "ahead") if threaded else None
+        self._look_ahead = _LOOK_AHEAD if threaded else 0
         self._ahead = Ahead(device, threaded)
         self._filter = MotionFilter(op, config.motion_filter, threaded)
-        self._renews = self.optimiser.begins and getattr(parts.uncertainty, "renews", False)
-        self._aside = self.optimiser.begins and hasattr(op, "aside")
+        begins, model = self.optimiser.begins, parts.uncertainty
+        self._renews = begins and isinstance(model, Renews) and model.renews
+        self._aside = begins and isinstance(op, SetsAside)
         self._times: list[float] = []
         self._indices: list[int] = []
         self._moved: list[float] = []
@@ -144,7 +146,7 @@ class SlamSystem:
     def track(self, frames: Iterable[Frame]) -> None:
         """Push all frames; the motion filter runs ahead of the window where it can."""
         judged = (self._judge(frame) for frame in frames)
-        for current, verdict in look_ahead(judged, _LOOK_AHEAD, self._pool, self._filter.close):
+        for current, verdict in look_ahead(judged, self._look_ahead, self._filter.close):
             self._push(current, verdict)
 
     def push(self, frame: Frame) -> bool:
@@ -159,7 +161,7 @@ class SlamSystem:
                 verdict = self._filter.judge(current)
             if verdict.keep:
                 current = self._with_movable(self._with_context(current))
-            if verdict.keep and self._pool is not None:
+            if verdict.keep and self._look_ahead > 0:
                 features, prior = self._maps.features(frame), self._maps.prior(frame)
                 current = replace(current, features=features, prior=prior)
             return replace(current, ready=self._ahead.ready()), verdict
@@ -262,9 +264,10 @@ class SlamSystem:
         )
         with self.clock("uncertainty"):
             view = self.optimiser.view()
-            if self._renews and self.optimiser.begun:
-                parts.uncertainty.renew(view, number, movable)  # type: ignore[attr-defined]
-            parts.uncertainty.append(view, number)
+            model, begun = parts.uncertainty, self._renews and self.optimiser.begun
+            if begun and isinstance(model, Renews) and movable is not None:
+                model.renew(view, number, movable)
+            model.append(view, number)
         self.optimiser.upright.see(number)
         return number
 
@@ -300,8 +303,6 @@ class SlamSystem:
         self._kept.clear()
         with self.clock("cloud"):
             records, cloud = self._records()
-        if self._pool is not None:
-            self._pool.shutdown(wait=False, cancel_futures=True)
         if not found.still:
             share = parallax(self.store, self.optimiser.gates())
             found = replace(found, parallax=share, points=len(cloud.xyz))

@@ -12,6 +12,7 @@ import torch
 
 from droidw.geometry.se3 import from_matrix, inv, rotation
 from droidw.geometry.transfer import upload
+from droidw.interfaces.correspondence import FindsLines
 from droidw.slam.doubt import doubtful
 from droidw.solve.manhattan import (
     Axes,
@@ -54,7 +55,7 @@ class Upright:
 
     Args:
         store: has the fields `axes` and `axes_information`.
-        correspondence: only one that has `line_segments` is asked.
+        correspondence: only one that `FindsLines` is asked.
         options: how much lines count, and where; None: nowhere.
         gates: number of the first keyframe -> [n,h,w] in [0,1], what of each is open.
         clock: where the time is added up.
@@ -71,13 +72,13 @@ class Upright:
         clock: Stopwatch,
     ) -> None:
         self._store = store
-        self._find = getattr(correspondence, "line_segments", None)
+        self._finder = correspondence if isinstance(correspondence, FindsLines) else None
         self._weight = 0.0 if options is None else options.weight
         self._least_share = 0.0 if options is None else options.least_share
         self._doubt = 1.0 if options is None else options.doubt
         self._gates = gates
         self._clock = clock
-        self._asked = self._find is not None and self._weight > 0
+        self._asked = self._finder is not None and self._weight > 0
         self.holds: bool | None = None if self._asked else False
 
     def see(self, number: int) -> None:
@@ -145,9 +146,11 @@ class Upright:
 
     def _look(self, number: int) -> None:
         """Find the lines of a keyframe, where correspondence can."""
-        if self._find is not None:
+        if self._finder is not None:
             info = self._store.infos[number]
-            info.lines = np.asarray(self._find(self._store.payload(number)), np.float32)
+            info.lines = np.asarray(
+                self._finder.line_segments(self._store.payload(number)), np.float32
+            )
 
     def measure(self) -> float:
         """The same, and lines count as before.

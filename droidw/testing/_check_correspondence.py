@@ -14,7 +14,10 @@ from droidw.interfaces.correspondence import (
     EdgeRequest,
     EdgeSession,
     EdgeUpdate,
+    FindsLines,
+    MatchesPoints,
     Motion,
+    SetsAside,
 )
 from droidw.slam.frame import Frame
 from droidw.testing._contract import Subject, same, snapshot
@@ -257,15 +260,15 @@ def _motion(subject: Subject, part: Any, payloads: list[Any]) -> None:
 
 def _aside(subject: Subject, part: Any, payloads: list[Any], grid: Grid) -> None:
     """Cells that are not to tell how far a picture moved, where the part can set them aside."""
-    aside = getattr(part, "aside", None)
-    if aside is None:
+    motion = part.motion
+    if not isinstance(part, SetsAside):
         return
     cells = torch.zeros(grid.height, grid.width, dtype=torch.bool, device=subject.device)
     with subject.calling("aside"):
-        same_as_ever = part.motion(aside(payloads[0], cells), payloads[1])
+        same_as_ever = motion(part.aside(payloads[0], cells), payloads[1])
         cells[:, : grid.width // 2] = True
-        half = part.motion(aside(payloads[0], cells), payloads[1])
-    whole = part.motion(payloads[0], payloads[1])
+        half = motion(part.aside(payloads[0], cells), payloads[1])
+    whole = motion(payloads[0], payloads[1])
     subject.expect(
         "aside",
         same_as_ever == whole,
@@ -282,13 +285,12 @@ def _points(
     subject: Subject, part: Any, payloads: list[Any], grid: Grid, size: tuple[int, int]
 ) -> None:
     """Points matched without a prediction, where the part has them."""
-    find = getattr(part, "matched_points", None)
-    if find is None:
+    if not isinstance(part, MatchesPoints):
         return
     gate = np.ones((grid.height, grid.width), np.float32)
     with subject.calling("matched_points"):
-        seen = np.asarray(find(payloads[0], payloads[1], gate, gate))
-        unseen = np.asarray(find(payloads[0], payloads[1], gate, 0 * gate))
+        seen = np.asarray(part.matched_points(payloads[0], payloads[1], gate, gate))
+        unseen = np.asarray(part.matched_points(payloads[0], payloads[1], gate, 0 * gate))
     subject.expect(
         "matched_points",
         _in_pictures(seen, size),
@@ -312,11 +314,10 @@ def _in_pictures(rows: np.ndarray, size: tuple[int, int]) -> bool:
 
 def _lines(subject: Subject, part: Any, payloads: list[Any], size: tuple[int, int]) -> None:
     """Straight edges of a picture, where the part finds them."""
-    find = getattr(part, "line_segments", None)
-    if find is None:
+    if not isinstance(part, FindsLines):
         return
     with subject.calling("line_segments"):
-        found, again = (np.asarray(find(payloads[0])) for _ in range(2))
+        found, again = (np.asarray(part.line_segments(payloads[0])) for _ in range(2))
     subject.expect(
         "line_segments",
         _in_pictures(found, size),

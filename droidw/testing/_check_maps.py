@@ -10,7 +10,7 @@ from torch import Tensor
 
 from droidw.geometry.camera import Grid
 from droidw.interfaces.depth import DepthMap, DepthPrior
-from droidw.interfaces.features import FeatureExtractor
+from droidw.interfaces.features import FeatureExtractor, KnowsMovable
 from droidw.slam.frame import Frame
 from droidw.testing._contract import Subject, same, snapshot
 from droidw.testing.scenes import Scene, SceneSpec
@@ -76,7 +76,7 @@ def feature_extractor(subject: Subject) -> None:
                 same(features, other),
                 f"two extractors of one seed give different features for {what}",
             )
-            if hasattr(part, "movable"):
+            if isinstance(part, KnowsMovable):
                 _movable(subject, part, image, grid, f"{what}, stride {stride},")
 
 

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from droidw.geometry import se3
 from droidw.interfaces.uncertainty import (
+    Begins,
+    Renews,
     StoreField,
     UncertaintyModel,
     UncertaintyReport,
@@ -40,9 +42,18 @@ def uncertainty_model(subject: Subject) -> None:
             same(maps[0], maps[1]),
             f"two models of one seed give different maps {label}",
         )
-    if getattr(part, "begins", False):
+    for name, offered, method in (
+        ("begins", Begins, "begin(view, movable)"),
+        ("renews", Renews, "renew(view, index, movable)"),
+    ):
+        subject.expect(
+            name,
+            isinstance(part, offered) or not getattr(part, name, False),
+            f"{name} is true, but there is no method {method}",
+        )
+    if isinstance(part, Begins) and part.begins:
         _begin(subject)
-    if getattr(part, "renews", False):
+    if isinstance(part, Renews) and part.renews:
         _renew(subject)
     _state(subject)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -37,14 +36,15 @@ def verdicts(ahead, drops, stride=1):
     """(frame, forced) of all candidates; the window drops those in `drops` that it may."""
     judge = MotionFilter(Table(), MotionFilterConfig(force_every=5), ahead)
     found = []
-    with ThreadPoolExecutor(1) as pool:
-        for k, verdict in look_ahead(
-            judged(judge, stride), 32, pool if ahead else None, judge.close
-        ):
-            if verdict.keep:
-                found.append((k, verdict.forced))
-                judge.settled(stride * k, verdict.forced or k not in drops)
+    for k, verdict in look_ahead(judged(judge, stride), 32 if ahead else 0, judge.close):
+        if verdict.keep:
+            found.append((k, verdict.forced))
+            judge.settled(stride * k, verdict.forced or k not in drops)
     return found
+
+
+def threads_ahead():
+    return [thread.name for thread in threading.enumerate() if thread.name.startswith("ahead")]
 
 
 @pytest.mark.parametrize("drops", [set(), MOVED, {3, 10, 17, 31}])
@@ -80,10 +80,23 @@ def test_it_goes_on_until_the_window_matters():
 
 def test_stopping_early_leaves_nobody_waiting():
     judge = MotionFilter(Table(), MotionFilterConfig(force_every=5), ahead=True)
-    with ThreadPoolExecutor(1) as pool:
-        ahead = look_ahead(judged(judge), 32, pool, judge.close)
-        assert [next(ahead)[0] for _ in range(4)] == [0, 1, 2, 3]
-        ahead.close()  # hangs if the thread waits for what the window says of frame 3
+    ahead = look_ahead(judged(judge), 32, judge.close)
+    assert [next(ahead)[0] for _ in range(4)] == [0, 1, 2, 3]
+    assert threads_ahead()
+    ahead.close()  # hangs if the thread waits for what the window says of frame 3
+    assert not threads_ahead()
+
+
+def test_what_fails_ahead_fails_here_and_leaves_no_thread():
+    def items():
+        yield 1
+        raise OSError("cannot be read")
+
+    ahead = look_ahead(items(), 32)
+    assert next(ahead) == 1
+    with pytest.raises(OSError, match="cannot be read"):
+        next(ahead)
+    assert not threads_ahead()
 
 
 class Counting(Table):
