@@ -5,6 +5,9 @@ The class of an error decides the exit code of the command line (`docs/cli.md`).
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Collection
+
 __all__ = [
     "ConfigError",
     "DroidwError",
@@ -14,6 +17,8 @@ __all__ = [
     "PluginError",
     "TrackingError",
     "UsageError",
+    "did_you_mean",
+    "nearest",
 ]
 
 
@@ -83,3 +88,32 @@ class Interrupted(DroidwError):
         super().__init__(message, hint)
         self.signum = signum
         self.exit_code = 128 + signum
+
+
+def nearest(name: str, valid: Collection[str]) -> str:
+    """The valid name most like `name`, or "" if none is near.
+
+    A name that goes on where the other ends (`affine`, `affine-softplus`) is near as well, but not
+    as near as one with a slip in it.
+    """
+    names = list(valid)
+    begun = [v for v in names if len(name) > 1 and v.startswith(name)]
+    begun += [v for v in names if len(v) > 2 and name.startswith(v)]
+    for among, cutoff in ((names, 0.8), (begun, 0.0), (names, 0.65)):
+        close = difflib.get_close_matches(name, among, n=1, cutoff=cutoff)
+        if close:
+            return close[0]
+    return ""
+
+
+def did_you_mean(name: str, valid: Collection[str], before: str = "", after: str = "") -> str:
+    """How the hint of an error begins that refuses a name: with the nearest valid one.
+
+    Args:
+        name: what was given. valid: what could have been.
+        before, after: what belongs around the name where it is typed.
+    Returns:
+        A question and the gap to what follows, or "" if no valid name is near.
+    """
+    near = nearest(name, valid)
+    return f"did you mean '{before}{near}{after}'?   " if near else ""

@@ -10,8 +10,7 @@ from typing import Any
 
 from droidw.config.load import Source, read_yaml
 from droidw.config.packaged import packaged_configs, packaged_in
-from droidw.errors import ConfigError, UsageError
-from droidw.plugin.registry import nearest
+from droidw.errors import ConfigError, UsageError, did_you_mean
 
 __all__ = ["Footage", "Layer", "Measuring", "Plan", "load_plan"]
 
@@ -105,11 +104,10 @@ def load_plan(
     reader = _Reader(tree, lines, lines[next(iter(tree))].file if tree else str(path))
     unknown = [key for key in tree if key not in _KEYS]
     if unknown:
-        near = nearest(unknown[0], _KEYS)
         raise reader.wrong(
             unknown[0],
             "no ablation has this key",
-            (f"did you mean '{near}'?   " if near else "") + f"keys: {', '.join(_KEYS)}\n"
+            did_you_mean(unknown[0], _KEYS) + f"keys: {', '.join(_KEYS)}\n"
             "keys of runs stand below base, sequences.NAME or rows.NAME",
         )
     plan = Plan(
@@ -128,10 +126,9 @@ def load_plan(
     )
     for row in rows:
         if row not in plan.rows:
-            near = nearest(row, plan.rows)
             raise UsageError(
                 f"--rows: {plan.file} has no row '{row}'",
-                (f"did you mean '{near}'?   " if near else "") + f"rows: {', '.join(plan.rows)}",
+                did_you_mean(row, plan.rows) + f"rows: {', '.join(plan.rows)}",
             )
     if rows:
         kept = {name: layer for name, layer in plan.rows.items() if name in rows}
@@ -149,10 +146,9 @@ def _find(file: str) -> Path:
     packaged = packaged_in("ablations")
     if file in packaged:
         return packaged[file]
-    near = nearest(file, packaged)
     raise UsageError(
         f"'{file}' is neither a file nor an ablation that comes with droidw",
-        (f"did you mean '{near}'?   " if near else "") + f"available: {', '.join(packaged)}",
+        did_you_mean(file, packaged) + f"available: {', '.join(packaged)}",
     )
 
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from droidw.cli.options import add_plugin_arguments, plugins_from
-from droidw.errors import UsageError
-from droidw.plugin.registry import KINDS, Entry, PluginNotFound, nearest
+from droidw.errors import UsageError, did_you_mean
+from droidw.plugin.registry import KINDS, Entry, PluginNotFound
 from droidw.plugin.weights import weights_name
 
 if TYPE_CHECKING:
@@ -78,10 +78,9 @@ def _selected(plugins: Plugins, kind: str | None, distribution: str | None) -> l
     if distribution is not None:
         known = sorted({e.distribution for e in plugins.entries()})
         if distribution not in known:
-            near = nearest(distribution, known)
             raise UsageError(
                 f"--from: no part comes from '{distribution}'",
-                (f"did you mean '{near}'?   " if near else "") + f"packages: {', '.join(known)}",
+                did_you_mean(distribution, known) + f"packages: {', '.join(known)}",
             )
         entries = [e for e in entries if e.distribution == distribution]
     return sorted(entries, key=lambda e: (order.index(e.kind), e.component.name))
@@ -148,10 +147,9 @@ def _named(plugins: Plugins, name: str, kind: str | None) -> list[Entry]:
     if kind is not None:
         plugins.registry(kind).entry(name)  # raises, with the nearest of that kind
     names = sorted({e.component.name for e in plugins.entries()})
-    near = nearest(name, names)
     raise PluginNotFound(
         f"--options: no part is called '{name}'",
-        (f"did you mean '{near}'?   " if near else "") + f"parts: {', '.join(names) or 'none'}",
+        did_you_mean(name, names) + f"parts: {', '.join(names) or 'none'}",
     )
 
 

@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Mapping, Sequence
 from types import ModuleType
 
-from droidw.errors import DroidwError, UsageError
+from droidw.errors import DroidwError, UsageError, did_you_mean
 
 __all__ = ["VERBS", "build_parser", "main"]
 
@@ -99,12 +99,9 @@ def _dispatch(arguments: list[str]) -> int:
         return 0 if general.help else 2
     verb, rest = arguments[before], arguments[before + 1 :]
     if verb not in VERBS:
-        from droidw.plugin.registry import nearest
-
-        near = nearest(verb, VERBS)
         raise UsageError(
             f"there is no command '{verb}'",
-            (f"did you mean '{near}'?   " if near else "") + f"commands: {', '.join(VERBS)}",
+            did_you_mean(verb, VERBS) + f"commands: {', '.join(VERBS)}",
         )
     if general.help:
         rest.append("--help")

@@ -14,8 +14,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from droidw.config.describe import limits_text, type_text, within
 from droidw.config.load import LoadedConfig
-from droidw.errors import ConfigError, PluginError
-from droidw.plugin.registry import nearest
+from droidw.errors import ConfigError, PluginError, did_you_mean
 
 __all__ = ["check_keys", "check_ranges", "typed"]
 
@@ -37,11 +36,10 @@ def check_keys(cls: type, data: Mapping[str, Any], prefix: str, loaded: LoadedCo
         full = f"{prefix}.{key}" if prefix else str(key)
         if key not in names:
             where = prefix or "the top level"
-            near = nearest(str(key), names)
             deeper = "options" in names and "name" in names
             raise ConfigError(
                 f"{loaded.at(full)}: there is no such key",
-                (f"did you mean '{prefix + '.' if prefix else ''}{near}'?   " if near else "")
+                did_you_mean(str(key), names, before=f"{prefix}." if prefix else "")
                 + f"keys of {where}: {', '.join(names) or 'none'}"
                 + (f"\noptions of the plugin go below {prefix}.options" if deeper else ""),
             )

@@ -18,8 +18,8 @@ import yaml
 
 from droidw.config.packaged import packaged_configs, packaged_in
 from droidw.config.schema import DroidwConfig
-from droidw.errors import ConfigError, UsageError
-from droidw.plugin.registry import SLOTS, nearest
+from droidw.errors import ConfigError, UsageError, did_you_mean
+from droidw.plugin.registry import SLOTS
 
 __all__ = [
     "LISTED",
@@ -284,10 +284,9 @@ def _preset_path(preset: str) -> Path:
     presets = packaged_in("presets")
     if preset in presets:
         return presets[preset]
-    near = nearest(preset, presets)
     raise UsageError(
         f"--preset: no preset is called '{preset}'",
-        (f"did you mean '{near}'?   " if near else "") + f"presets: {', '.join(presets)}, auto",
+        did_you_mean(preset, presets) + f"presets: {', '.join(presets)}, auto",
     )
 
 
@@ -300,10 +299,9 @@ def _extended(name: str, file: Path, where: Source) -> Path:
     for candidate in (beside, beside.with_name(beside.name + ".yaml")):
         if candidate.is_file():
             return candidate
-    near = nearest(name, packaged)
     raise ConfigError(
         f"{where}: extends: there is no file or packaged config '{name}'",
-        (f"did you mean '{near}'?   " if near else "")
+        did_you_mean(name, packaged)
         + f"packaged: {', '.join(packaged)}\nor a path relative to {file.parent or '.'}",
     )
 

@@ -20,10 +20,16 @@ from droidw.config.inert import check_inert
 from droidw.config.load import LISTED, LoadedConfig, Source, load_config
 from droidw.config.packaged import packaged_in
 from droidw.config.schema import DroidwConfig
-from droidw.errors import ConfigError, DroidwError, MissingRequirementError, PluginError
+from droidw.errors import (
+    ConfigError,
+    DroidwError,
+    MissingRequirementError,
+    PluginError,
+    did_you_mean,
+)
 from droidw.plugin.component import Component
 from droidw.plugin.manager import Plugins
-from droidw.plugin.registry import FETCH, SLOTS, Entry, PluginNotFound, nearest
+from droidw.plugin.registry import FETCH, SLOTS, Entry, PluginNotFound
 
 __all__ = ["COMPAT", "ResolvedConfig", "choose_preset", "needs_preset", "resolve"]
 
@@ -271,11 +277,9 @@ def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
     phases = list(DroidwConfig().schedule)
     for phase in config.schedule:
         if phase not in phases:
-            near = nearest(phase, phases)
             raise ConfigError(
                 f"{loaded.at(f'schedule.{phase}')}: there is no such phase",
-                (f"did you mean 'schedule.{near}'?   " if near else "")
-                + f"phases: {', '.join(phases)}",
+                did_you_mean(phase, phases, before="schedule.") + f"phases: {', '.join(phases)}",
             )
     check_inert(config, loaded)
     if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", config.device):
@@ -285,10 +289,9 @@ def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
         )
     for name in config.compat:
         if name not in COMPAT:
-            near = nearest(name, COMPAT)
             raise ConfigError(
                 f"{loaded.at('compat')}: no published behaviour is called '{name}'",
-                (f"did you mean '{near}'?   " if near else "") + f"valid: {', '.join(COMPAT)}",
+                did_you_mean(name, COMPAT) + f"valid: {', '.join(COMPAT)}",
             )
 
 

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from droidw.errors import InputError
-from droidw.plugin.registry import nearest
+from droidw.errors import InputError, did_you_mean
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Camera
@@ -124,11 +123,11 @@ class DatasetTable:
         for row in self.sequences.values():
             if name in (row.name, *row.also):
                 return row
-        near = nearest(name, [n for row in self.sequences.values() for n in (row.name, *row.also)])
+        names = [n for row in self.sequences.values() for n in (row.name, *row.also)]
         said = f"{self.title} has no sequence '{name}'" if name else f"{self.name}: which sequence?"
         raise InputError(
             said,
-            (f"did you mean '{self.name}:{near}'?   " if near else "")
+            did_you_mean(name, names, before=f"{self.name}:")
             + f"sequences: {', '.join(self.sequences)}",
         )
 
@@ -146,10 +145,9 @@ def load_table(name: str) -> DatasetTable:
     """
     names = table_names()
     if name not in names:
-        near = nearest(name, names)
         raise InputError(
             f"no dataset is called '{name}'",
-            (f"did you mean '{near}'?   " if near else "") + f"datasets: {', '.join(names)}",
+            did_you_mean(name, names) + f"datasets: {', '.join(names)}",
         )
     text = (_folder() / f"{name}.yaml").read_text(encoding="utf-8")
     told = yaml.safe_load(text)["dataset"]

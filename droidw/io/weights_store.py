@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from droidw.errors import DroidwError, InputError, PluginError, UsageError
+from droidw.errors import DroidwError, InputError, PluginError, UsageError, did_you_mean
 from droidw.io.download import DownloadError, Progress, download, sha256_of
 from droidw.io.files import atomic_write
 from droidw.io.weights import RECORDS, fingerprint, read_records, read_state
-from droidw.plugin.registry import Entry, nearest
+from droidw.plugin.registry import Entry
 from droidw.plugin.weights import WeightsFile, find_weights
 
 if TYPE_CHECKING:
@@ -120,10 +120,9 @@ class WeightsStore:
         for known in self.known.values():
             if name in (known.file.name, known.file.file):
                 return known.file
-        near = nearest(name, self.known)
         raise UsageError(
             f"no weights are called '{name}'",
-            (f"did you mean '{near}'?   " if near else "")
+            did_you_mean(name, self.known)
             + f"weights: {', '.join(self.known) or 'no plugin names any'}",
         )
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import pluggy
 
-from droidw.errors import PluginError
+from droidw.errors import PluginError, nearest
 from droidw.plugin.component import Component
-from droidw.plugin.registry import KINDS, nearest
+from droidw.plugin.registry import KINDS
 from droidw.plugin.weights import WeightsFile
 
 __all__ = ["HOOKS", "checked_components", "explained", "import_file", "problem_of"]

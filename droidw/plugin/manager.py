@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import pluggy
 
-from droidw.errors import PluginError, UsageError
+from droidw.errors import PluginError, UsageError, did_you_mean
 from droidw.plugin import hookspecs
 from droidw.plugin.checks import HOOKS, checked_components, explained, import_file, problem_of
 from droidw.plugin.component import Component
-from droidw.plugin.registry import FROM_PYTHON, KINDS, Entry, Failure, Registry, nearest
+from droidw.plugin.registry import FROM_PYTHON, KINDS, Entry, Failure, Registry
 
 if TYPE_CHECKING:
     from importlib import metadata
@@ -85,10 +85,9 @@ class Plugins:
             UsageError: there is no such kind.
         """
         if kind not in KINDS:
-            near = nearest(kind, KINDS)
             raise UsageError(
                 f"there is no kind of plugin called '{kind}'",
-                (f"did you mean '{near}'?   " if near else "") + "kinds: " + ", ".join(KINDS),
+                did_you_mean(kind, KINDS) + "kinds: " + ", ".join(KINDS),
             )
         entries = [e for e in self._entries if e.kind == kind]
         disabled = self.disabled()

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import shlex
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import util
 from pathlib import Path
 from typing import Any
 
-from droidw.errors import ConfigError, MissingRequirementError, PluginError
+from droidw.errors import ConfigError, MissingRequirementError, PluginError, did_you_mean
 from droidw.plugin.component import Component
 from droidw.plugin.weights import find_weights, weights_name
 
@@ -24,7 +23,6 @@ __all__ = [
     "Kind",
     "PluginNotFound",
     "Registry",
-    "nearest",
 ]
 
 
@@ -66,22 +64,6 @@ FROM_PYTHON = "registered from Python"
 
 SLOTS: tuple[str, ...] = ("features", "depth", "uncertainty", "ba", "correspondence", "reader")
 """Kinds of which a run has exactly one; the key in the configuration is the name of the kind."""
-
-
-def nearest(name: str, valid: Collection[str]) -> str:
-    """The valid name most like `name`, or "" if none is near.
-
-    A name that goes on where the other ends (`affine`, `affine-softplus`) is near as well, but not
-    as near as one with a slip in it.
-    """
-    names = list(valid)
-    begun = [v for v in names if len(name) > 1 and v.startswith(name)]
-    begun += [v for v in names if len(v) > 2 and name.startswith(v)]
-    for among, cutoff in ((names, 0.8), (begun, 0.0), (names, 0.65)):
-        close = difflib.get_close_matches(name, among, n=1, cutoff=cutoff)
-        if close:
-            return close[0]
-    return ""
 
 
 @dataclass(frozen=True)
@@ -297,8 +279,7 @@ class Registry:
                     f"plugin '{name}' of {failure.origin} failed to load: {failure.error}",
                     failure.hint,
                 )
-        near = nearest(name, self.names())
-        hint = (f"did you mean '{near}'?   " if near else "") + f"available: {self._available()}"
+        hint = did_you_mean(name, self.names()) + f"available: {self._available()}"
         for failure in self.failures:
             hint += f"\nnot loaded: {failure.name} ({failure.origin}): {failure.error}"
         hint += f"\nsee: droidw list-plugins --kind {self.kind.name}"

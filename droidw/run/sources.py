@@ -6,10 +6,9 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from droidw.errors import InputError
+from droidw.errors import InputError, did_you_mean
 from droidw.interfaces.datasets import Selection
 from droidw.io.dataset_tables import split_source, table_names
-from droidw.plugin.registry import nearest
 
 if TYPE_CHECKING:
     from droidw.config.resolve import ResolvedConfig
@@ -58,10 +57,9 @@ def _unknown(source: str, readers: list[str]) -> InputError:
     parted = split_source(source)
     if parted is not None:
         names = sorted({*table_names(), *readers})
-        near = nearest(parted[0], names)
         return InputError(
             f"{source}: no dataset is called '{parted[0]}'",
-            (f"did you mean '{near}:{parted[1]}'?   " if near else "")
+            did_you_mean(parted[0], names, after=f":{parted[1]}")
             + f"datasets: {', '.join(table_names())}   (sequences: droidw data list)\n{choose}",
         )
     found = (

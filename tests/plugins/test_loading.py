@@ -10,8 +10,8 @@ from importlib import metadata
 import pytest
 
 import droidw
-from droidw.errors import MissingRequirementError, PluginError, UsageError
-from droidw.plugin.registry import KINDS, PluginNotFound, nearest
+from droidw.errors import MissingRequirementError, PluginError, UsageError, nearest
+from droidw.plugin.registry import KINDS, PluginNotFound
 
 SOUND = """
 from __future__ import annotations
