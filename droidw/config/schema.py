@@ -179,7 +179,7 @@ class BackendConfig:
     )
     last_slip: float = opt(0.5, "`global_solver.cauchy_slip` of those passes", ge=0)
     last_planes: float = opt(
-        0.01, "`global_solver.planes` of those passes, if `planes_hidden` is reached", ge=0
+        0.1, "`global_solver.planes` of those passes, if `planes_hidden` is reached", ge=0
     )
     planes_hidden: float = opt(
         0.05,
