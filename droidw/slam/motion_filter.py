@@ -236,6 +236,4 @@ def look_ahead(
     finally:
         stop()
         # The source may not be closed while the thread is inside it.
-        for future in waiting:
-            future.cancel()
-        pool.shutdown(wait=True)
+        pool.shutdown(wait=True, cancel_futures=True)
