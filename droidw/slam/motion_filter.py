@@ -1,13 +1,10 @@
-"""Which frames are worth a keyframe, and how far ahead of that question one can work."""
+"""Which frames are worth a keyframe, judged ahead of the window as far as that can be known."""
 
 from __future__ import annotations
 
 import threading
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -23,9 +20,7 @@ if TYPE_CHECKING:
     from droidw.interfaces.correspondence import Correspondence
     from droidw.slam.frame import Frame
 
-T = TypeVar("T")
-
-__all__ = ["Encoded", "MotionFilter", "Verdict", "look_ahead", "spans"]
+__all__ = ["Encoded", "MotionFilter", "Verdict", "spans"]
 
 # Most of a picture is taken to stand still, whatever could move; and of pictures in which nothing
 # does, up to a tenth is taken for what can. In between it counts little by little: no one cell
@@ -207,33 +202,3 @@ def spans(
     if options.movable_above > 0:
         gone = gone | (movable > options.movable_above)
     return nearness(gone, options)
-
-
-def look_ahead(
-    items: Iterable[T], depth: int, stop: Callable[[], None] = lambda: None
-) -> Iterator[T]:
-    """Yield items in order, while a thread makes up to `depth` of those to come.
-
-    Args:
-        items: made one after the other.
-        depth: 0: each is made when it is asked for, without a thread.
-        stop: called when no more items are wanted, so that the thread waits for nothing.
-    """
-    if depth <= 0:
-        yield from items
-        return
-    source = iter(items)
-    waiting: deque[Future[T | None]] = deque()
-    pool = ThreadPoolExecutor(1, "ahead")
-    try:
-        while True:
-            while len(waiting) <= depth:
-                waiting.append(pool.submit(next, source, None))
-            item = waiting.popleft().result()
-            if item is None:
-                return
-            yield item
-    finally:
-        stop()
-        # The source may not be closed while the thread is inside it.
-        pool.shutdown(wait=True, cancel_futures=True)

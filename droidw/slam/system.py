@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ from droidw.geometry.se3 import inv
 from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.interfaces.correspondence import SetsAside
 from droidw.interfaces.uncertainty import Renews
+from droidw.io.prefetch import prefetch
 from droidw.slam.backend import Backend
 from droidw.slam.backwards import doubted
 from droidw.slam.cell_maps import CellMaps
@@ -27,7 +29,7 @@ from droidw.slam.filler import Filler
 from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
-from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict, look_ahead
+from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.records import Outcome, keyframe_records
 from droidw.slam.streams import Ahead, nbytes
@@ -146,8 +148,9 @@ class SlamSystem:
     def track(self, frames: Iterable[Frame]) -> None:
         """Push all frames; the motion filter runs ahead of the window where it can."""
         judged = (self._judge(frame) for frame in frames)
-        for current, verdict in look_ahead(judged, self._look_ahead, self._filter.close):
-            self._push(current, verdict)
+        with closing(prefetch(judged, self._look_ahead, self._filter.close)) as ahead:
+            for current, verdict in ahead:
+                self._push(current, verdict)
 
     def push(self, frame: Frame) -> bool:
         """Track one frame; returns whether it is a keyframe now."""
@@ -162,8 +165,8 @@ class SlamSystem:
             if verdict.keep:
                 current = self._with_movable(self._with_context(current))
             if verdict.keep and self._look_ahead > 0:
-                features, prior = self._maps.features(frame), self._maps.prior(frame)
-                current = replace(current, features=features, prior=prior)
+                maps = self._maps
+                current = replace(current, features=maps.features(frame), prior=maps.prior(frame))
             return replace(current, ready=self._ahead.ready()), verdict
 
     def _hide(self, plain: Encoded) -> Encoded:
@@ -250,18 +253,12 @@ class SlamSystem:
         )
         if current.plain is not None:
             info.whole = current.plain.context, self._maps.unmasked(current.plain.frame)
-        known = {"unmasked": self._maps.unmasked(frame)}
+        known = {"T_cw": pose, "disps": disp, "features": features, "prior": prior}
+        known["unmasked"] = self._maps.unmasked(frame)
         movable = current.movable
         if movable is not None:
             known["movable"] = movable
-        number = store.append(
-            info,
-            T_cw=pose,
-            disps=disp,
-            features=features,
-            prior=prior,
-            **known,
-        )
+        number = store.append(info, **known)
         with self.clock("uncertainty"):
             view = self.optimiser.view()
             model, begun = parts.uncertainty, self._renews and self.optimiser.begun

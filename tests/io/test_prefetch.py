@@ -1,4 +1,4 @@
-"""Decoding ahead: order, bounds, exceptions carried over, and threads that end."""
+"""Working ahead: order, bounds, exceptions carried over, and threads that end."""
 
 from __future__ import annotations
 
@@ -67,3 +67,25 @@ def test_closing_early_ends_the_thread_and_closes_the_source():
 
 def test_none_is_an_item_like_any_other():
     assert list(prefetch([None, 1, None])) == [None, 1, None]
+
+
+def test_nothing_ahead_needs_no_thread():
+    ahead = prefetch(range(3), ahead=0)
+    assert next(ahead) == 0
+    assert threads() == []
+    assert list(ahead) == [1, 2]
+
+
+def test_a_source_that_waits_for_its_items_is_told_to_stop():
+    told = threading.Event()
+
+    def source():
+        yield 1
+        assert told.wait(10)
+        yield 2
+
+    ahead = prefetch(source(), stop=told.set)
+    assert next(ahead) == 1
+    ahead.close()
+    assert told.is_set()
+    assert threads() == []

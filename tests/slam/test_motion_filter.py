@@ -10,8 +10,9 @@ import torch
 
 from droidw.config.schema import MotionFilterConfig
 from droidw.interfaces.correspondence import Motion
+from droidw.io.prefetch import prefetch
 from droidw.slam.frame import Frame
-from droidw.slam.motion_filter import Encoded, MotionFilter, look_ahead, spans
+from droidw.slam.motion_filter import Encoded, MotionFilter, spans
 
 COUNT = 60
 MOVED = {k for k in range(COUNT) if k % 7 in (3, 4)}
@@ -36,7 +37,7 @@ def verdicts(ahead, drops, stride=1):
     """(frame, forced) of all candidates; the window drops those in `drops` that it may."""
     judge = MotionFilter(Table(), MotionFilterConfig(force_every=5), ahead)
     found = []
-    for k, verdict in look_ahead(judged(judge, stride), 32 if ahead else 0, judge.close):
+    for k, verdict in prefetch(judged(judge, stride), 32 if ahead else 0, judge.close):
         if verdict.keep:
             found.append((k, verdict.forced))
             judge.settled(stride * k, verdict.forced or k not in drops)
@@ -44,7 +45,9 @@ def verdicts(ahead, drops, stride=1):
 
 
 def threads_ahead():
-    return [thread.name for thread in threading.enumerate() if thread.name.startswith("ahead")]
+    return [
+        thread.name for thread in threading.enumerate() if thread.name.startswith("droidw-prefetch")
+    ]
 
 
 @pytest.mark.parametrize("drops", [set(), MOVED, {3, 10, 17, 31}])
@@ -80,22 +83,10 @@ def test_it_goes_on_until_the_window_matters():
 
 def test_stopping_early_leaves_nobody_waiting():
     judge = MotionFilter(Table(), MotionFilterConfig(force_every=5), ahead=True)
-    ahead = look_ahead(judged(judge), 32, judge.close)
+    ahead = prefetch(judged(judge), 32, judge.close)
     assert [next(ahead)[0] for _ in range(4)] == [0, 1, 2, 3]
     assert threads_ahead()
     ahead.close()  # hangs if the thread waits for what the window says of frame 3
-    assert not threads_ahead()
-
-
-def test_what_fails_ahead_fails_here_and_leaves_no_thread():
-    def items():
-        yield 1
-        raise OSError("cannot be read")
-
-    ahead = look_ahead(items(), 32)
-    assert next(ahead) == 1
-    with pytest.raises(OSError, match="cannot be read"):
-        next(ahead)
     assert not threads_ahead()
 
 
