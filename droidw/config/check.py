@@ -74,7 +74,7 @@ def typed(cls: type, data: Mapping[str, Any], prefix: str, loaded: LoadedConfig)
         for name, hint in typing.get_type_hints(cls).items():
             if typing.get_origin(hint) is dict and isinstance(data.get(name), Mapping):
                 defaults[name] = {}  # else keys that were taken out would come back
-        node = OmegaConf.merge(defaults, OmegaConf.create(dict(data)))
+        node = OmegaConf.unsafe_merge(defaults, dict(data))  # both are used once
         made = OmegaConf.to_object(node)
     except OmegaConfBaseException as error:
         key = str(getattr(error, "full_key", "") or "")

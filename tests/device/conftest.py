@@ -18,7 +18,8 @@ QUICK = (
     "exporters={trajectory: {}}", "observers.report=null", "observers.progress=null", "threads=1",
     "motion_filter.force_every=2", "frontend.warmup=4", "frontend.max_factors=12",
     "frontend.keyframe_threshold=0", "frontend.starts=false", "frontend.redundant=newest",
-    "filler.updates=1", "backend.passes=[1]", "camera.refine_focal=false",
+    "frontend.unknown_moves=1", "filler.updates=1", "backend.passes=[1]",
+    "camera.refine_focal=false",
     "schedule.init_blind.updates=1", "schedule.init.updates=1", "schedule.init_again.updates=0",
     "schedule.window.updates=1", "schedule.window_kept.updates=1",
 )  # fmt: skip
@@ -42,7 +43,7 @@ def weights(tmp_path_factory):
 def go(clip, weights, tmp_path, monkeypatch, capsys):
     """Run on a device: `go(device, *arguments)` -> (exit code, stderr, centres [N,3]).
 
-    What is in `after` overrules `QUICK`.
+    What is in `arguments` overrules `QUICK`, and what is in `after` both.
     """
     monkeypatch.setenv("DROIDW_WEIGHTS", str(weights))
 
@@ -50,7 +51,7 @@ def go(clip, weights, tmp_path, monkeypatch, capsys):
         out = tmp_path / device.replace(":", "")
         code = main(
             ["run", source or str(clip), "-o", str(out), "--overwrite", "--device", device,
-             *arguments, *QUICK, *after]
+             *QUICK, *arguments, *after]
         )  # fmt: skip
         wrong = capsys.readouterr().err
         assert "Traceback" not in wrong, wrong

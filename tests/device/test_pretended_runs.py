@@ -25,8 +25,10 @@ RUNS = {
     "the preset cpu with one search": (*FLOW,),
     "two searches": (*CPU,),
     "match, and residuals both ways": (
-        *FLOW, "frontend.predict=match", "weighting.bidirectional=true", "camera.refine_focal=true",
-        "frontend.starts=true",
+        *FLOW, "frontend.predict=match", "weighting.bidirectional=true",
+    ),
+    "several starts, and a focal length": (
+        *FLOW, "frontend.starts=true", "camera.refine_focal=true", "input.max_frames=8",
     ),
     "no parts": (*FLOW, "features=none", "uncertainty=none"),
     "per-pixel": (*FLOW, "uncertainty=per-pixel"),
@@ -56,8 +58,11 @@ RUNS = {
 }  # fmt: skip
 
 
-MORE = {"cnn without calibration", "dinov2", "metric3d", "droid, low memory", "a guarded step"}
-"""Left to `--runslow`: of these, too, some other run has most."""
+MORE = {
+    "several starts, and a focal length", "cnn without calibration", "dinov2", "metric3d",
+    "droid, low memory", "a guarded step",
+}  # fmt: skip
+"""Left to `--runslow`: they take long, or some other run has most of them."""
 
 APART = {"two searches": 2e-2, "refresh and tolerance": 2e-2}
 """Share of the path by which centres may differ where a threshold picks, elsewhere 2e-3."""
