@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from droidw.ablation.plan import Footage, Layer, Measuring, Plan
-from droidw.config.load import load_config, override_layers
+from droidw.config.load import YAML_LOADER, load_config, override_layers
 from droidw.config.resolve import ResolvedConfig, choose_preset, resolve
 from droidw.errors import DroidwError, InputError, MissingRequirementError, PluginError
 from droidw.io.dataset_tables import data_root, split_source, table_names
@@ -23,8 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Cell", "Outcome", "make_cells", "prepare", "read_outcome"]
 
-# Written in C where PyYAML has them: there is a configuration for every cell.
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+# Written in C where PyYAML has it: there is a configuration for every cell.
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
 _QUICK: Layer = (
@@ -188,7 +187,7 @@ def _folder(data: Path) -> Path:
 
 def _with(text: str, values: Mapping[str, Any]) -> str:
     """A resolved configuration with other values of these full keys."""
-    tree = yaml.load(text, Loader=_LOADER)
+    tree = yaml.load(text, Loader=YAML_LOADER)
     for key, value in values.items():
         *path, last = key.split(".")
         part = tree

@@ -23,6 +23,7 @@ from droidw.plugin.registry import SLOTS
 
 __all__ = [
     "LISTED",
+    "YAML_LOADER",
     "LoadedConfig",
     "Source",
     "load_config",
@@ -33,9 +34,10 @@ __all__ = [
 LISTED = ("exporters", "observers")
 """Keys that map names of plugins to their options, any number at a time."""
 
+YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""Written in C where PyYAML has it: an ablation reads its files once for every row."""
+
 _COMMAND_LINE = "command line"
-# Written in C where PyYAML has it: an ablation reads its files once for every row.
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)")
 _Tree = dict[str, Any]
 
@@ -264,7 +266,7 @@ def _override(text: str) -> tuple[list[str], Any]:
             "example: camera.long_side=512   or   uncertainty=none",
         )
     try:
-        node = yaml.compose(value, Loader=_LOADER)
+        node = yaml.compose(value, Loader=YAML_LOADER)
     except yaml.YAMLError as error:
         raise UsageError(
             f"{_COMMAND_LINE}: {key}: the value {value!r} is not YAML: "
@@ -332,7 +334,7 @@ def read_yaml(path: Path) -> tuple[_Tree, dict[str, Source]]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{shown}: cannot be read: {error}") from error
     try:
-        node = yaml.compose(text, Loader=_LOADER)
+        node = yaml.compose(text, Loader=YAML_LOADER)
     except yaml.YAMLError as error:
         raise ConfigError(f"{shown}: is not YAML: " + " ".join(str(error).split())) from error
     if node is None:
