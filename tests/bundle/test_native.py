@@ -12,7 +12,7 @@ import torch
 from droidw.errors import MissingRequirementError
 from droidw.plugin.component import BuildContext
 from droidw.plugin.manager import load_plugins
-from droidw_plugins.bundle import _build, auto_ba, native_ba
+from droidw_plugins.bundle import _build, _native_calls, auto_ba, native_ba
 from droidw_plugins.bundle._native_calls import native_recipe
 
 CPU = BuildContext(device=torch.device("cpu"))
@@ -67,8 +67,9 @@ def test_what_would_be_read_out_of_bounds_is_refused(make, compiler, change):
         native_ba.NativeBundleAdjuster().step(replace(p, **{name: value}))
 
 
-def test_the_library_is_built_once_and_found_again(compiler):
-    recipe = native_recipe()
+def test_the_library_is_built_once_and_found_again(compiler, monkeypatch, tmp_path):
+    monkeypatch.setenv(_build.CACHE_VARIABLE, str(tmp_path))  # nobody else compiles there
+    recipe = replace(native_recipe(), attempts=(("-std=c++17", "-O0", "-shared", "-fPIC"),))
     first = _build.build(recipe)
     made = first.stat().st_mtime_ns
     assert first.parent == _build.kernels_dir()
@@ -92,6 +93,25 @@ def test_the_cache_goes_where_the_variables_say():
     assert str(_build.kernels_dir({"DROIDW_CACHE": "/a"})) == "/a/kernels"
     assert str(_build.kernels_dir({"XDG_CACHE_HOME": "/b"})) == "/b/droidw/kernels"
     assert _build.kernels_dir({}).parts[-3:] == (".cache", "droidw", "kernels")
+
+
+def test_a_library_is_of_one_kind_of_number(make, compiler, monkeypatch, tmp_path):
+    monkeypatch.setenv(_build.CACHE_VARIABLE, str(tmp_path))
+    monkeypatch.setattr(_native_calls, "_PLAIN", ("-std=c++17", "-O0", "-shared", "-fPIC"))
+    adjuster = native_ba.NativeBundleAdjuster()
+    p, _, _ = make(noise=0.02, dtype=torch.float32)
+    adjuster.step(p)
+    assert [path.name.rpartition("-")[0] for path in _libraries()] == ["native"]
+    p, _, _ = make(noise=0.02)
+    assert adjuster.step(p).disps.dtype == torch.float64
+    assert sorted(path.name.rpartition("-")[0] for path in _libraries()) == [
+        "native",
+        "native-float64",
+    ]
+
+
+def _libraries():
+    return list(_build.kernels_dir().glob(f"*{_build._suffix()}"))
 
 
 def test_a_failing_compiler_is_quoted_with_a_way_out(broken_compiler):

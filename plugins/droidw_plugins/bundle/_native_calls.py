@@ -23,9 +23,9 @@ from droidw_plugins.bundle._build import (
     first_found,
 )
 
-__all__ = ["NativeKernels", "load_native", "native_recipe"]
+__all__ = ["NativeKernels", "NativeLibraries", "native_recipe"]
 
-_VERSION = 3
+_VERSION = 4
 _STATUS = ("ok", "rejected", "singular", "nonfinite", "empty")
 _COMPILERS = ("c++", "g++", "clang++")
 _PLAIN = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
@@ -57,22 +57,28 @@ class _Report(ctypes.Structure):
     ]
 
 
-def native_recipe() -> Recipe | None:
-    """How the kernels are compiled for this processor; None without a C++ compiler."""
+def native_recipe(dtype: torch.dtype = torch.float32) -> Recipe | None:
+    """How the kernels are compiled for this processor; None without a C++ compiler.
+
+    Args:
+        dtype: of the numbers that they work on, float32 or float64.
+    """
     wanted = os.environ.get("CXX", "").split()
     compiler = first_found([*wanted[:1], *_COMPILERS])
     if not compiler:
         return None
     tuned = ("-mcpu=native",) if platform.machine() in ("arm64", "aarch64") else ("-march=native",)
+    double = dtype == torch.float64
+    plain = (*_PLAIN, *(("-DDW_NUMBER=double",) if double else ()))
     return Recipe(
-        name="native",
+        name="native-float64" if double else "native",
         compiler=compiler,
         version=compiler_version(compiler),
         attempts=(
-            (*_PLAIN, *tuned, "-fopenmp"),
-            (*_PLAIN, *tuned),  # clang as Apple ships it has no OpenMP
-            (*_PLAIN, "-fopenmp"),
-            _PLAIN,
+            (*plain, *tuned, "-fopenmp"),
+            (*plain, *tuned),  # clang as Apple ships it has no OpenMP
+            (*plain, "-fopenmp"),
+            plain,
         ),
         source="native.cpp",
         target=_processor(),
@@ -90,13 +96,29 @@ def _processor() -> str:
     return " ".join(sorted({line for line in lines if line.startswith(wanted)}))
 
 
-def load_native() -> ctypes.CDLL:
-    """The library, compiled now if it is not in the cache.
+class NativeLibraries:
+    """The library for float32, and that for float64 once it is asked for.
 
     Raises:
         BuildError: there is no compiler, it failed, or the library cannot be loaded.
     """
-    recipe = native_recipe()
+
+    def __init__(self) -> None:
+        self._loaded = {torch.float32: _load(torch.float32)}
+
+    def of(self, dtype: torch.dtype) -> ctypes.CDLL:
+        """The library for numbers of this dtype, compiled now if it is not in the cache.
+
+        Raises:
+            BuildError: as above.
+        """
+        if dtype not in self._loaded:
+            self._loaded[dtype] = _load(dtype)
+        return self._loaded[dtype]
+
+
+def _load(dtype: torch.dtype) -> ctypes.CDLL:
+    recipe = native_recipe(dtype)
     if recipe is None:
         raise BuildError(
             f"no C++ compiler was found (looked for $CXX, {', '.join(_COMPILERS)}); install "
@@ -108,7 +130,7 @@ def load_native() -> ctypes.CDLL:
         library.dw_native_open.restype = c_void_p
         library.dw_native_close.argtypes = [c_void_p]
         library.dw_native_close.restype = None
-        library.dw_native_step.argtypes = [c_void_p, POINTER(_Problem), c_int32, POINTER(_Report)]
+        library.dw_native_step.argtypes = [c_void_p, POINTER(_Problem), POINTER(_Report)]
         version = int(library.dw_native_version())
     except (OSError, AttributeError) as error:
         raise BuildError(f"{path} cannot be loaded ({error}); delete it to try again") from error
@@ -118,19 +140,26 @@ def load_native() -> ctypes.CDLL:
 
 
 class NativeKernels:
-    """The loaded library, with scratch memory of its own.
+    """The kernels of a step, with scratch memory of their own.
 
     Raises:
-        BuildError: there is no compiler, it failed, or the library cannot be loaded.
+        BuildError: as of `NativeLibraries`.
     """
 
     def __init__(self) -> None:
-        library = load_native()
-        self._library = library
-        self._handle = library.dw_native_open()
-        if not self._handle:
-            raise MemoryError("no memory for the kernels' workspace")
-        weakref.finalize(self, library.dw_native_close, self._handle)
+        self._libraries = NativeLibraries()
+        self._work: dict[torch.dtype, int] = {}
+
+    def _opened(self, dtype: torch.dtype) -> tuple[ctypes.CDLL, int]:
+        """The library for these numbers, and its scratch memory."""
+        library = self._libraries.of(dtype)
+        if dtype not in self._work:
+            work: int | None = library.dw_native_open()
+            if not work:
+                raise MemoryError("no memory for the kernels' workspace")
+            weakref.finalize(self, library.dw_native_close, work)
+            self._work[dtype] = work
+        return library, self._work[dtype]
 
     def step(self, problem: BAProblem, threads: int, halvings: int) -> Step:
         """One step; `threads` at least 1.
@@ -138,6 +167,7 @@ class NativeKernels:
         Raises:
             ValueError: an edge names a frame that does not exist, or shapes do not fit.
             MemoryError: there is not enough memory.
+            BuildError: a problem is the first in float64, and that library cannot be made.
         """
         n, h, w = problem.disps.shape
         edges = problem.ii.shape[0]
@@ -179,7 +209,8 @@ class NativeKernels:
             T_out.data_ptr(), disps_out.data_ptr(), isolated.data_ptr(),
         )  # fmt: skip
         told = _Report()
-        if self._library.dw_native_step(self._handle, call, dtype.itemsize, told):
+        library, work = self._opened(dtype)
+        if library.dw_native_step(work, call, told):
             raise MemoryError(f"not enough memory for a step over {edges} edges of {h}x{w} cells")
         report = Report(
             _STATUS[told.status],  # type: ignore[arg-type]

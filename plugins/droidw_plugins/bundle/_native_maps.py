@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-from ctypes import byref, c_double, c_int32, c_int64, c_void_p
+from ctypes import byref, c_double, c_int64, c_void_p
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from droidw_plugins.bundle._native_calls import load_native
+from droidw_plugins.bundle._native_calls import NativeLibraries
 from droidw_plugins.bundle.maps import Sampled, finish_distance
 
 __all__ = ["NativeMaps"]
@@ -48,7 +48,7 @@ class NativeMaps:
     """
 
     def __init__(self) -> None:
-        self._library = load_native()
+        self._libraries = NativeLibraries()
 
     def similarity(
         self, features: Tensor, samples: Sampled, lengths: Tensor | None = None
@@ -73,7 +73,7 @@ class NativeMaps:
             (c_int64 * 4)(*samples.steps), weights.data_ptr(), features.data_ptr(),
             lengths.data_ptr(), cosine=cosine.data_ptr(), threads=torch.get_num_threads(),
         )  # fmt: skip
-        self._library.dw_native_similarity(byref(job), c_int32(features.element_size()))
+        self._libraries.of(features.dtype).dw_native_similarity(byref(job))
         return cosine
 
     def pair_gradient(self, u: Tensor, rho: Tensor, samples: Sampled) -> tuple[Tensor, Tensor]:
@@ -90,7 +90,7 @@ class NativeMaps:
             rho.data_ptr(), here.data_ptr(), there.data_ptr(), gradient.data_ptr(), None,
             energy.data_ptr(), torch.get_num_threads(),
         )  # fmt: skip
-        self._library.dw_native_data_term(byref(job), c_int32(u.element_size()))
+        self._libraries.of(u.dtype).dw_native_data_term(byref(job))
         return gradient, energy.sum().to(u.dtype)
 
     def frame_distance(
@@ -120,7 +120,7 @@ class NativeMaps:
             ii.shape[0], h, w, T_cw.data_ptr(), disps.data_ptr(), ii.data_ptr(), jj.data_ptr(),
             fx, fy, cx, cy, sums.data_ptr(), torch.get_num_threads(),
         )  # fmt: skip
-        self._library.dw_native_flow(byref(job), c_int32(disps.element_size()))
+        self._libraries.of(disps.dtype).dw_native_flow(byref(job))
         return finish_distance(sums, h * w, beta, bidirectional).to(disps.dtype)
 
 

@@ -1,5 +1,8 @@
 // Backend `native`: one Gauss-Newton step on a CPU. Plain C interface, called through ctypes.
 //
+// A library is compiled for one kind of number, DW_NUMBER: most of the time it takes to compile is
+// for its kernels, and a run needs one of them.
+//
 // The result does not depend on the number of threads: the cells are cut into units of a fixed
 // size, each with sums of its own, and those are added up in one order.
 
@@ -11,6 +14,10 @@
 #include "native_unit.h"
 #include "native_views.h"
 #include "parallel.h"
+
+#ifndef DW_NUMBER
+#define DW_NUMBER float
+#endif
 
 namespace dw {
 
@@ -319,45 +326,32 @@ Report step(const Problem& p, Workspace<S>& work) {
     return p.channels == 3 ? Stepper<S, true>(p, work).run() : Stepper<S, false>(p, work).run();
 }
 
-struct Handle {
-    Workspace<float> single;
-    Workspace<double> full;
-};
+using Number = DW_NUMBER;
 
 }  // namespace dw
 
 extern "C" {
 
 // Raised whenever the layout of `Problem` or `Report` changes.
-int32_t dw_native_version() { return 3; }
+int32_t dw_native_version() { return 4; }
 
-void* dw_native_open() { return new (std::nothrow) dw::Handle(); }
+void* dw_native_open() { return new (std::nothrow) dw::Workspace<dw::Number>(); }
 
-void dw_native_close(void* handle) { delete static_cast<dw::Handle*>(handle); }
+void dw_native_close(void* work) { delete static_cast<dw::Workspace<dw::Number>*>(work); }
 
-// One step; size is that of a number, 4 or 8. Returns 0, or 1 if there was not enough memory.
-int32_t dw_native_step(void* handle, const dw::Problem* p, int32_t size, dw::Report* report) {
+// One step. Returns 0, or 1 if there was not enough memory.
+int32_t dw_native_step(void* work, const dw::Problem* p, dw::Report* report) {
     try {
-        dw::Handle* held = static_cast<dw::Handle*>(handle);
-        *report = size == 8 ? dw::step(*p, held->full) : dw::step(*p, held->single);
+        *report = dw::step(*p, *static_cast<dw::Workspace<dw::Number>*>(work));
         return 0;
     } catch (const std::bad_alloc&) {
         return 1;
     }
 }
 
-// Maps and distances; size as above.
-void dw_native_similarity(const dw::SampleJob* job, int32_t size) {
-    if (size == 8) dw::similarity<double>(*job);
-    else dw::similarity<float>(*job);
-}
-void dw_native_data_term(const dw::SampleJob* job, int32_t size) {
-    if (size == 8) dw::data_term<double>(*job);
-    else dw::data_term<float>(*job);
-}
-void dw_native_flow(const dw::FlowJob* job, int32_t size) {
-    if (size == 8) dw::flow_sums<double>(*job);
-    else dw::flow_sums<float>(*job);
-}
+// Maps and distances.
+void dw_native_similarity(const dw::SampleJob* job) { dw::similarity<dw::Number>(*job); }
+void dw_native_data_term(const dw::SampleJob* job) { dw::data_term<dw::Number>(*job); }
+void dw_native_flow(const dw::FlowJob* job) { dw::flow_sums<dw::Number>(*job); }
 
 }  // extern "C"
