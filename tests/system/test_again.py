@@ -20,6 +20,8 @@ from droidw.slam.system import SlamSystem
 
 LEARNED = (
     "features=cnn", "uncertainty=affine-softplus", "threads=1", "frontend.unknown_moves=1",
+    # half of the time of a run: points, matched in doubt, and several starts
+    "correspondence.options.seeds=0", "frontend.starts=false",
 )  # fmt: skip
 AGAIN = (*LEARNED, "frontend.again_below=1")
 
@@ -192,9 +194,13 @@ def test_a_users_mask_holds_in_both(go, footage, watched, tmp_path):
     assert float(two.unmasked[..., 16:].max()) == 0.0
 
 
-@pytest.mark.parametrize("error", [RuntimeError("no more"), KeyboardInterrupt()])
 @pytest.mark.parametrize(
-    ("owner", "stage"), [(_Run, "_build"), (SlamSystem, "track"), (SlamSystem, "finish")]
+    ("owner", "stage", "error"),
+    [
+        (_Run, "_build", RuntimeError("no more")),
+        (SlamSystem, "track", KeyboardInterrupt()),
+        (SlamSystem, "finish", RuntimeError("no more")),
+    ],
 )
 def test_what_was_found_first_stays_if_the_second_time_fails(
     go, footage, watched, monkeypatch, owner, stage, error
