@@ -111,7 +111,11 @@ def test_what_can_move_is_asked_of_all_keyframes(system, keep, above, threaded):
 
     Of the first ones alone where nobody needs the others.
     """
-    settings = (f"uncertainty.options.movable_keep={keep}", f"motion_filter.movable_above={above}")
+    settings = (
+        f"uncertainty.options.movable_keep={keep}",
+        f"motion_filter.movable_above={above}",
+        "frontend.starts=false",
+    )
     slam, frames = system(threaded, (*LEARNED, *settings))
     features, model, op = slam.parts.features, slam.parts.uncertainty, slam.parts.correspondence
     asked, renewed, aside = [], [], []
