@@ -194,13 +194,9 @@ def test_a_users_mask_holds_in_both(go, footage, watched, tmp_path):
     assert float(two.unmasked[..., 16:].max()) == 0.0
 
 
+@pytest.mark.parametrize("error", [RuntimeError("no more"), KeyboardInterrupt()])
 @pytest.mark.parametrize(
-    ("owner", "stage", "error"),
-    [
-        (_Run, "_build", RuntimeError("no more")),
-        (SlamSystem, "track", KeyboardInterrupt()),
-        (SlamSystem, "finish", RuntimeError("no more")),
-    ],
+    ("owner", "stage"), [(_Run, "_build"), (SlamSystem, "track"), (SlamSystem, "finish")]
 )
 def test_what_was_found_first_stays_if_the_second_time_fails(
     go, footage, watched, monkeypatch, owner, stage, error

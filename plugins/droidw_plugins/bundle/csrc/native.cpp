@@ -332,7 +332,7 @@ using Number = DW_NUMBER;
 
 extern "C" {
 
-// Raised whenever the layout of `Problem` or `Report` changes.
+// Raised whenever a call, or the layout of `Problem` or `Report`, changes.
 int32_t dw_native_version() { return 4; }
 
 void* dw_native_open() { return new (std::nothrow) dw::Workspace<dw::Number>(); }
