@@ -101,6 +101,13 @@ class MotionFilterConfig:
         0.03, "matched share below which a frame counts as blank or unrelated", ge=0, le=1
     )
     patience: int = opt(10, "unrelated frames in a row after which one is taken all the same", ge=1)
+    last_above: float = opt(
+        0.25,
+        "share of `threshold` by which the picture has moved since the last keyframe for the last "
+        "frame to become one, so that no frame lies beyond all keyframes (1: it is as any other)",
+        ge=0,
+        le=1,
+    )
 
 
 @dataclass

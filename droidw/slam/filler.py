@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from droidw.geometry.interpolate import interpolate
 from droidw.geometry.se3 import exp, inv, log, mul
+from droidw.slam.frame import Trajectory
 from droidw.slam.locate import locate
 from droidw.slam.smoothing import smoothed
 
@@ -72,6 +74,37 @@ class Filler:
         if updates == 0 or len(self._times) < 2:
             return list(start.unbind(0))
         return list(self._refine(batch, start, updates).unbind(0))
+
+    def trajectory(
+        self,
+        indices: Sequence[int],
+        times: Sequence[float],
+        rest: Iterable[Encoded] | None,
+        tell: Callable[[int], None],
+    ) -> Trajectory:
+        """A pose for every frame.
+
+        Args:
+            indices, times: of all frames. rest: those that are no keyframes; None: these are
+                interpolated, and no more. tell: how many of them are done, now and then.
+        """
+        poses: dict[int, Tensor] = {}
+        pending = iter(rest or ())
+        while batch := list(islice(pending, self.config.filler.batch)):
+            for encoded, pose in zip(batch, self.fill(batch), strict=True):
+                poses[encoded.frame.index] = pose
+            tell(len(poses))
+        for index, time in zip(indices, times, strict=True):
+            if self.is_keyframe(index):
+                poses[index] = self.keyframe_pose(index)
+            elif index not in poses:
+                poses[index] = self.start(time)
+        T_cw = torch.stack([poses[i] for i in indices]).double()
+        held = np.asarray([self.is_keyframe(i) for i in indices])
+        if rest is not None:
+            T_cw = self.smoothed(T_cw, times, held)
+        stamps = np.asarray(times, dtype=np.float64)
+        return Trajectory(times=stamps, T_wc=inv(T_cw).cpu().numpy(), is_keyframe=held)
 
     def smoothed(self, T_cw: Tensor, times: Sequence[float], held: npt.NDArray[np.bool_]) -> Tensor:
         """The whole path [N,7], float64, with frames that are no keyframes on a steady motion.

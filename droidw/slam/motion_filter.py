@@ -119,6 +119,23 @@ class MotionFilter:
             self._accept(current, forced)
         return Verdict(keep=keep or forced, forced=forced, motion=motion)
 
+    def ends(self, verdict: Verdict, newest: int) -> bool:
+        """Whether the last frame becomes a keyframe because there is no other.
+
+        Frames beyond all keyframes are seen from one side only, and several times as far off.
+
+        Args:
+            verdict: on that frame. newest: index of the frame of the newest keyframe.
+        """
+        options, motion = self._options, verdict.motion
+        if self._reference is None or motion is None or options.last_above >= 1:
+            return False
+        if motion.matched < options.lost_below:
+            return False
+        # What it was compared with may have been dropped: that had moved, too.
+        dropped = self._reference.frame.index != newest
+        return dropped or motion.flow > options.last_above * self._threshold
+
     def set_aside(
         self, current: Encoded, cells: Tensor | None, masked: Tensor | None = None
     ) -> None:

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 import torch
-from torch import Tensor
 
 from droidw.errors import InputError
 from droidw.events import Dispatcher, FrameTracked, KeyframeAdded, KeyframeRemoved, Progress
 from droidw.geometry.camera import Grid
-from droidw.geometry.se3 import inv
 from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.interfaces.correspondence import SetsAside
 from droidw.interfaces.uncertainty import Renews
@@ -130,6 +128,7 @@ class SlamSystem:
         self._moved: list[float] = []
         self._matched: list[float] = []
         self._kept: dict[int, object] = {}
+        self._newest: tuple[Encoded, Verdict] | None = None
         self._hidden = hidden or (lambda index: None)
         self._room = config.filler.cache_mb * 1e6
 
@@ -220,6 +219,7 @@ class SlamSystem:
         kept = False
         if verdict.keep:
             kept = self._keyframe(current, verdict.forced)
+        self._newest = None if kept else (current, verdict)
         self.events.emit(FrameTracked(frame.index, frame.time, len(self._times), len(self.store)))
         return kept
 
@@ -277,6 +277,8 @@ class SlamSystem:
             reread: a fresh pass over the same frames, for those that could not be held.
             brief: after an interruption: no global passes, and only interpolated poses.
         """
+        if not brief:
+            self._end()
         if not self.frontend.initialised and len(self.store) >= 2:
             with self.clock("frontend"):
                 self.frontend.initialise()
@@ -316,6 +318,14 @@ class SlamSystem:
             reports={**self.optimiser.reports, **unusable(self.store)},
         )
 
+    def _end(self) -> None:
+        """Make the last frame a keyframe if it has moved on from the one before."""
+        if self._newest is not None:
+            current, verdict = self._newest
+            self._newest = None
+            if self._filter.ends(verdict, self.store.infos[-1].index):
+                self._keyframe(self._with_movable(self._with_context(current)), forced=True)
+
     def _reveal(self) -> None:
         """From now on nothing is hidden: matches are made with whole pictures."""
         for number, info in enumerate(self.store.infos):
@@ -335,37 +345,14 @@ class SlamSystem:
         self.store.T_cw.copy_(self.store.T_cw[:1].clone().expand_as(self.store.T_cw))
 
     def _trajectory(self, reread: Callable[[], Iterable[Frame]], quick: bool) -> Trajectory:
-        filler = Filler(self.optimiser, self.config)
-        poses: dict[int, Tensor] = {}
-        pending: list[Encoded] = []
-        done = 0
-
-        def flush() -> None:
-            nonlocal done
-            for encoded, pose in zip(pending, filler.fill(pending), strict=True):
-                poses[encoded.frame.index] = pose
-            done += len(pending)
-            pending.clear()
-            self.events.emit(Progress("fill", done, len(self._times)))
-
-        if not quick:
-            for encoded in self._unfilled(filler, reread):
-                pending.append(encoded)
-                if len(pending) == self.config.filler.batch:
-                    flush()
-            if pending:
-                flush()
-        for index, time in zip(self._indices, self._times, strict=True):
-            if filler.is_keyframe(index):
-                poses[index] = filler.keyframe_pose(index)
-            elif index not in poses:
-                poses[index] = filler.start(time)
-        T_cw = torch.stack([poses[i] for i in self._indices]).double()
-        held = np.asarray([filler.is_keyframe(i) for i in self._indices])
-        if not quick:
-            T_cw = filler.smoothed(T_cw, self._times, held)
-        times = np.asarray(self._times, dtype=np.float64)
-        return Trajectory(times=times, T_wc=inv(T_cw).cpu().numpy(), is_keyframe=held)
+        filler, count = Filler(self.optimiser, self.config), len(self._times)
+        rest = None if quick else self._unfilled(filler, reread)
+        return filler.trajectory(
+            self._indices,
+            self._times,
+            rest,
+            lambda done: self.events.emit(Progress("fill", done, count)),
+        )
 
     def _unfilled(self, filler: Filler, reread: Callable[[], Iterable[Frame]]) -> Iterator[Encoded]:
         """Every frame that is no keyframe, from memory or from a second pass."""

@@ -174,3 +174,35 @@ def test_keyframes_come_nearer_where_something_is_hidden(aside, nearer, limit, h
     assert judge.judge(frames[1]).keep
     moving.flow = 1.2
     assert not judge.judge(frames[2]).keep
+
+
+class Flows:
+    """Correspondence that says what it is asked to."""
+
+    def motion(self, reference, current):
+        return current
+
+
+@pytest.mark.parametrize(
+    ("flow", "matched", "above", "kept", "expected"),
+    [
+        (0.5, 1.0, 0.25, True, True),
+        (0.3, 1.0, 0.25, True, False),  # the picture hardly moved since
+        (0.3, 1.0, 0.0, True, True),
+        (0.5, 0.01, 0.25, True, False),  # nothing of it is known again
+        (0.3, 1.0, 0.25, False, True),  # since a keyframe that was dropped; it had moved itself
+        (1.2, 1.0, 1.0, True, False),  # as any other
+        (0.3, 1.0, 1.0, False, False),
+    ],
+)
+def test_whether_the_last_frame_becomes_a_keyframe(flow, matched, above, kept, expected):
+    judge = MotionFilter(Flows(), MotionFilterConfig(last_above=above))
+    blank = torch.zeros(0)
+    pictures = [None, Motion(2.0, 1.0), Motion(flow, matched)]
+    first, second, last = (
+        judge.judge(Encoded(Frame(k, k / 30, blank, blank), picture))
+        for k, picture in enumerate(pictures)
+    )
+    assert first.keep and second.keep and not last.keep
+    assert judge.ends(last, 1 if kept else 0) is expected
+    assert not judge.ends(first, 0)
