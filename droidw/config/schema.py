@@ -175,6 +175,18 @@ class BackendConfig:
     """Global bundle adjustment after tracking."""
 
     passes: list[int] = opt([2, 2, 2, 2, 2], "update steps of each global pass")
+    more_passes: int = opt(
+        4,
+        "times that the last pass is made again at most, while it moves what poses and depths "
+        "predict by more than `at_rest`, but for a path of which less than `restart_below` agrees",
+        ge=0,
+    )
+    at_rest: float = opt(
+        0.0125,
+        "cells by which a pass may move what poses and depths predict, in the median of a "
+        "keyframe: a tenth of all keyframes may be above",
+        ge=0,
+    )
     wide_start: float = opt(
         16.0,
         "how many times wider than `global_solver.cauchy` the kernel of the first of several "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -15,10 +16,12 @@ from droidw.geometry.transfer import upload
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import backend_edges, frontend_edges
 from droidw.interfaces.correspondence import Upsamples
+from droidw.slam.convergence import moved_by
 from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 from droidw.slam.motion_filter import spans
 from droidw.slam.passes import all_passes
+from droidw.slam.path import Path
 from droidw.slam.seen_through import moves_ahead, open_though_seen_through
 from droidw.solve.weights import closed_share
 
@@ -123,7 +126,11 @@ class Backend:
         done = 0
         graph = None
         anew = False
-        for number, part in enumerate(self.passes):
+        again = options.more_passes if self.fresh else 0
+        passes = deque(self.passes)
+        while passes:
+            part = passes.popleft()
+            before = Path.of(store)
             learns = self.fresh and options.learn and part.learns
             if learns and not anew:
                 self.optimiser.begin_anew()
@@ -164,11 +171,33 @@ class Backend:
                     self.config.camera,
                     self.focal_known,
                 )
-            if number == len(self.passes) - 1:
+            if passes:
+                continue
+            gates = self.optimiser.gates()
+            self.agreement = explained_share(store, graph, graph.select(), gates)
+            if again > 0 and self._moves_on(before, gates):
+                again -= 1
+                total += part.updates
+                passes.append(replace(part, refines=False))
+            else:
                 self._upsample(session, shown)
-                gates = self.optimiser.gates()
-                self.agreement = explained_share(store, graph, graph.select(), gates)
         return graph
+
+    def _moves_on(self, before: Path, gates: Tensor) -> bool:
+        """Whether the path had not come to rest before this pass, and is worth another one.
+
+        A path in doubt is not: it is measured in other ways afterwards.
+        """
+        options = self.config.backend
+        if self.optimiser.upright.doubts(self.agreement, options.restart_below):
+            return False
+        moved = moved_by(before, self.optimiser.store, gates)
+        _log.info(
+            "the last pass moved what poses and depths predict by %.3f cells (backend.at_rest=%g)",
+            moved,
+            options.at_rest,
+        )
+        return moved > options.at_rest
 
     def _solver(self, kernel: Kernel) -> SolverConfig:
         """The solver of a pass with this kernel.

@@ -424,3 +424,38 @@ def test_cells_that_say_little_do_not_hold_on_to_the_scale_of_a_piece(arc, waves
         left.append((off(store.T_cw) / off(T_cw) - 1) / 0.1)
     assert left[0] > 0.3
     assert abs(left[1]) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("options", "fresh", "agreement", "expected"),
+    [
+        ({}, True, 1.0, 5),
+        ({"more_passes": 1}, True, 1.0, 4),
+        ({"more_passes": 0}, True, 1.0, 3),
+        ({"at_rest": 0.2}, True, 1.0, 3),
+        ({"at_rest": 0.05}, True, 1.0, 4),
+        # in doubt: to be measured in other ways
+        ({}, True, 0.5, 3),
+        # one of those other ways
+        ({}, False, 1.0, 3),
+    ],
+)
+def test_the_last_pass_is_made_again_until_the_path_has_come_to_rest(
+    broken, monkeypatch, options, fresh, agreement, expected
+):
+    """It grows longer by a few tenths of a cell, and by a third of that in each further pass."""
+    backend, _ = broken(**{"passes": [1, 1, 1], **options})
+    backend.fresh = fresh
+    store, heard, told = backend.optimiser.store, [], []
+
+    def update(graph, session, phase, solver, **more):
+        heard.append((solver.cauchy_tuning, phase.learn))
+        store.T_cw[:, 0] += torch.linspace(0, 0.9, COUNT) / 3 ** len(heard)
+
+    monkeypatch.setattr(backend.optimiser, "update", update)
+    monkeypatch.setattr(module, "explained_share", lambda *given: agreement)
+    backend.run(lambda done, total: told.append((done, total)))
+    assert len(heard) == expected
+    assert set(heard[3:]) <= {heard[2]}
+    assert told[-1] == (expected, expected)
+    assert all(done <= total for done, total in told)
