@@ -93,7 +93,7 @@ def test_the_whole_page(full: RunResult, tmp_path: Path) -> None:
         "ate_rmse": 0.0123,
         "unit": "m",
         "align": "sim3",
-        "ate_percent": 0.8,
+        "ate_percent": 0.047,
         "rpe_trans_rmse": None,
         "notes": [],
         "masks": {"auc": 0.943},
@@ -104,6 +104,7 @@ def test_the_whole_page(full: RunResult, tmp_path: Path) -> None:
         "kitchen", "23.4", "0.0123", "0.943", "812", "Warnings (1)", "the focal length is a guess",
         "from camera.txt", "track", "8.40 s", "long_side: 320", "2.13.0", "1.5 kB",
         "6 of 10, evenly chosen", "EfficientNet", "no GPU was found", "13.40 s in all",
+        "0.05 % of the path",
     ):  # fmt: skip
         assert said in page.text, said
     assert page.count["figure"] == 2 + 1 + 2 + 6

@@ -154,7 +154,7 @@ def _tiles(result: RunResult, paths: Paths, metrics: Mapping[str, Any]) -> str:
     if ate is not None:
         percent = number(metrics.get("ate_percent"))
         how = str(metrics.get("align", "sim3"))
-        more = f"after {how}" + (f", {percent:.1f} % of the path" if percent is not None else "")
+        more = f"after {how}" + (f", {percent:.2f} % of the path" if percent is not None else "")
         tiles.append(tile(f"{ate:.3g}", unit, "ATE RMSE", more))
     masks = metrics.get("masks")
     if isinstance(masks, Mapping) and number(masks.get("auc")) is not None:
