@@ -182,7 +182,7 @@ class BackendConfig:
         ge=0,
     )
     at_rest: float = opt(
-        0.0125,
+        0.006,
         "cells by which a pass may move what poses and depths predict, in the median of a "
         "keyframe: a tenth of all keyframes may be above",
         ge=0,

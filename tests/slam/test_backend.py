@@ -429,7 +429,8 @@ def test_cells_that_say_little_do_not_hold_on_to_the_scale_of_a_piece(arc, waves
 @pytest.mark.parametrize(
     ("options", "fresh", "agreement", "expected"),
     [
-        ({}, True, 1.0, 5),
+        ({}, True, 1.0, 6),
+        ({"at_rest": 0.0125}, True, 1.0, 5),
         ({"more_passes": 1}, True, 1.0, 4),
         ({"more_passes": 0}, True, 1.0, 3),
         ({"at_rest": 0.2}, True, 1.0, 3),
