@@ -47,4 +47,4 @@ def moved_by(before: Path, store: KeyframeStore, gates: Tensor) -> float:
         )
         counts = seen & still & (gates[k] >= CLOSED)
         medians.append((now - was).norm(dim=-1).masked_fill(~counts, torch.nan).nanmedian())
-    return float(torch.stack(medians).nanquantile(_MOST).nan_to_num())
+    return float(torch.stack(medians).cpu().nanquantile(_MOST).nan_to_num())

@@ -11,7 +11,11 @@ from droidw.slam.system import SlamSystem
 from droidw.testing.pretend_gpu import PretendGpu
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
 
-CPU = ("--preset", "cpu", "ba=torch", "frontend.predict=velocity")
+# One pass more, whether the path has come to rest or not: rounding may decide otherwise.
+CPU = (
+    "--preset", "cpu", "ba=torch", "frontend.predict=velocity",
+    "backend.more_passes=1", "backend.at_rest=0",
+)  # fmt: skip
 # One search: a second one rests on cells that a threshold picks, and rounding picks others. Nor is
 # there an exposure to take out, for up to half of a hundredth is none, nor is a picture resampled,
 # for that is done at whole 32nds of a pixel.
