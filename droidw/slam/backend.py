@@ -78,7 +78,7 @@ class Backend:
         """Make the passes; where much is seen through what seems far away, once more without that.
 
         Args:
-            tell: called with (update steps done, update steps in all).
+            tell: called with (update steps done, those in all so far: `more_passes` adds to them).
         Returns:
             The number of edges of the last pass, 0 if there was nothing to do.
         """
@@ -193,7 +193,7 @@ class Backend:
             return False
         moved = moved_by(before, self.optimiser.store, gates)
         _log.info(
-            "the last pass moved what poses and depths predict by %.3f cells (backend.at_rest=%g)",
+            "the last pass moved what poses and depths predict by %.4f cells (backend.at_rest=%g)",
             moved,
             options.at_rest,
         )
