@@ -177,8 +177,9 @@ class BackendConfig:
     passes: list[int] = opt([2, 2, 2, 2, 2], "update steps of each global pass")
     more_passes: int = opt(
         4,
-        "times that the last pass is made again at most, while it moves what poses and depths "
-        "predict by more than `at_rest`, but for a path of which less than `restart_below` agrees",
+        "times that the last pass is made again at most, if `edges_hidden` is reached, while it "
+        "moves what poses and depths predict by more than `at_rest`, but for a path of which less "
+        "than `restart_below` agrees",
         ge=0,
     )
     at_rest: float = opt(

@@ -186,9 +186,12 @@ class Backend:
     def _moves_on(self, before: Path, gates: Tensor) -> bool:
         """Whether the path had not come to rest before this pass, and is worth another one.
 
-        A path in doubt is not: it is measured in other ways afterwards.
+        A path in doubt is not: it is measured in other ways afterwards. Nor is one of which little
+        is hidden: more passes do not bring it nearer to the truth.
         """
         options = self.config.backend
+        if self._hidden() < options.edges_hidden:
+            return False
         if self.optimiser.upright.doubts(self.agreement, options.restart_below):
             return False
         moved = moved_by(before, self.optimiser.store, gates)

@@ -435,6 +435,8 @@ def test_cells_that_say_little_do_not_hold_on_to_the_scale_of_a_piece(arc, waves
         ({"more_passes": 0}, True, 1.0, 3),
         ({"at_rest": 0.2}, True, 1.0, 3),
         ({"at_rest": 0.05}, True, 1.0, 4),
+        # an eighth of each picture is hidden
+        ({"edges_hidden": 0.2}, True, 1.0, 3),
         # in doubt: to be measured in other ways
         ({}, True, 0.5, 3),
         # one of those other ways
@@ -448,6 +450,7 @@ def test_the_last_pass_is_made_again_until_the_path_has_come_to_rest(
     backend, _ = broken(**{"passes": [1, 1, 1], **options})
     backend.fresh = fresh
     store, heard, told = backend.optimiser.store, [], []
+    store["unmasked"][: len(store), :1] = 0.0
 
     def update(graph, session, phase, solver, **more):
         heard.append((solver.cauchy_tuning, phase.learn))
