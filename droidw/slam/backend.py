@@ -130,7 +130,7 @@ class Backend:
         passes = deque(self.passes)
         while passes:
             part = passes.popleft()
-            before = Path.of(store)
+            before = Path.of(store) if again > 0 and not passes else None
             learns = self.fresh and options.learn and part.learns
             if learns and not anew:
                 self.optimiser.begin_anew()
@@ -175,7 +175,7 @@ class Backend:
                 continue
             gates = self.optimiser.gates()
             self.agreement = explained_share(store, graph, graph.select(), gates)
-            if again > 0 and self._moves_on(before, gates):
+            if before is not None and self._moves_on(before, gates):
                 again -= 1
                 total += part.updates
                 passes.append(replace(part, refines=False))
@@ -190,7 +190,7 @@ class Backend:
         is hidden: more passes do not bring it nearer to the truth.
         """
         options = self.config.backend
-        if self._hidden() < options.edges_hidden:
+        if closed_share(gates) < options.edges_hidden:
             return False
         if self.optimiser.upright.doubts(self.agreement, options.restart_below):
             return False
