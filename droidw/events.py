@@ -55,7 +55,10 @@ class FrameTracked(Event):
 
 @dataclass(frozen=True)
 class KeyframeAdded(Event):
-    """Keyframe number `keyframe` (position in the store) was made from frame `index`."""
+    """Keyframe number `keyframe` (position in the store) was made from frame `index`.
+
+    It is the last one, or comes in between others: later ones move up.
+    """
 
     keyframe: int
     index: int

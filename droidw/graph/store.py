@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from droidw.geometry.camera import Grid
+from droidw.geometry.transfer import upload
 from droidw.interfaces.uncertainty import StoreField
 
 __all__ = ["KeyframeInfo", "KeyframeStore"]
@@ -171,6 +172,15 @@ class KeyframeStore:
         for data in self._data.values():
             data[index : n - 1] = data[index + 1 : n].clone()
         del self.infos[index]
+
+    def sort(self) -> None:
+        """Bring keyframes into the order of their frames, with all their fields."""
+        n = len(self.infos)
+        order = sorted(range(n), key=lambda k: self.infos[k].index)
+        at = upload(torch.tensor(order, dtype=torch.int64), self.device)
+        for data in self._data.values():
+            data[:n] = data[at]
+        self.infos[:] = [self.infos[k] for k in order]
 
     def write(self, T_cw: Tensor, disps: Tensor) -> None:
         """Replace poses and disparities of all keyframes."""

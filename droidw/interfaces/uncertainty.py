@@ -114,8 +114,9 @@ class UncertaintyModel(Protocol):
     fields: tuple[StoreField, ...]
 
     def append(self, view: UncertaintyView, index: int) -> None:
-        """Write `view.uncertainty[index]` (and own fields) for a keyframe just appended.
+        """Write `view.uncertainty[index]` (and own fields) for a new keyframe.
 
+        It is the last one, or came in between others, which moved up by then with all their fields.
         `view.ii`, `jj`, `target` and `confidence` are empty here.
         """
         ...

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
     from droidw.config.schema import DroidwConfig, SolverConfig
     from droidw.interfaces.correspondence import EdgeSession
+    from droidw.slam.between import Between
     from droidw.slam.optimise import Optimiser
     from droidw.slam.passes import Kernel, Pass
 
@@ -49,6 +50,7 @@ class Backend:
         motion_prior: how much steady motion counts in the first pass, as `backend.motion_prior`.
         passes: to make; None: those of the configuration.
         fresh: the path was just tracked: `backend.learn` and `backend.seen_through` count.
+        between: adds keyframes as `backend.between` says; None: there are no more.
     Attributes:
         passes: those that `run` makes.
         focal: what the search for a better focal length found, None without one.
@@ -63,6 +65,7 @@ class Backend:
         motion_prior: float = 0.0,
         passes: Sequence[Pass] | None = None,
         fresh: bool = False,
+        between: Between | None = None,
     ) -> None:
         self.optimiser = optimiser
         self.config = config
@@ -71,6 +74,7 @@ class Backend:
         self.focal_known = focal_known
         self.motion_prior = motion_prior
         self.fresh = fresh
+        self._between = between
         self.focal: FocalSearch | None = None
         self.agreement = float("nan")
 
@@ -93,6 +97,8 @@ class Backend:
                 store.intrinsics.copy_(given[0])
                 store.image_intrinsics.copy_(given[1])
                 self.optimiser.upright.measure()
+            if self._between is not None:
+                self._between.remove()
             graph = self._make(tell)
         return 0 if graph is None else len(graph)
 
@@ -130,6 +136,8 @@ class Backend:
         passes = deque(self.passes)
         while passes:
             part = passes.popleft()
+            if part.kernel == "narrowest" and graph is not None:
+                self._add_between(graph)
             before = Path.of(store) if again > 0 and not passes else None
             learns = self.fresh and options.learn and part.learns
             if learns and not anew:
@@ -182,6 +190,21 @@ class Backend:
             else:
                 self._upsample(session, shown)
         return graph
+
+    def _add_between(self, graph: FactorGraph) -> None:
+        """More keyframes, where much is hidden and the path is not in doubt.
+
+        Args:
+            graph: of the pass before, with what was measured last.
+        """
+        options = self.config.backend
+        if self._between is None or self._hidden() < options.between_hidden:
+            return
+        agreement = explained_share(
+            self.optimiser.store, graph, graph.select(), self.optimiser.gates()
+        )
+        if not self.optimiser.upright.doubts(agreement, options.restart_below):
+            self._between.add()
 
     def _moves_on(self, before: Path, gates: Tensor) -> bool:
         """Whether the path had not come to rest before this pass, and is worth another one.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -14,12 +14,13 @@ import torch
 from droidw.errors import InputError
 from droidw.events import Dispatcher, FrameTracked, KeyframeAdded, KeyframeRemoved, Progress
 from droidw.geometry.camera import Grid
-from droidw.graph.store import KeyframeInfo, KeyframeStore
+from droidw.graph.store import KeyframeStore
 from droidw.interfaces.correspondence import SetsAside
 from droidw.interfaces.uncertainty import Renews
 from droidw.io.prefetch import prefetch
 from droidw.slam.backend import Backend
 from droidw.slam.backwards import doubted
+from droidw.slam.between import Between
 from droidw.slam.cell_maps import CellMaps
 from droidw.slam.cloud import consistent_depth, static_cloud
 from droidw.slam.diagnosis import diagnose, parallax, unusable
@@ -27,6 +28,7 @@ from droidw.slam.filler import Filler
 from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
+from droidw.slam.keyframes import Keyframes
 from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.records import Outcome, keyframe_records
@@ -35,6 +37,8 @@ from droidw.slam.timing import Stopwatch
 from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from droidw.config.schema import DroidwConfig
     from droidw.geometry.camera import Camera
 
@@ -123,6 +127,7 @@ class SlamSystem:
         begins, model = self.optimiser.begins, parts.uncertainty
         self._renews = begins and isinstance(model, Renews) and model.renews
         self._aside = begins and isinstance(op, SetsAside)
+        self._keyframes = Keyframes(self.optimiser, self._maps, self._renews)
         self._times: list[float] = []
         self._indices: list[int] = []
         self._moved: list[float] = []
@@ -190,14 +195,18 @@ class SlamSystem:
         """What can move in a keyframe, where anyone asks; the filter is told what is hidden."""
         above, frame = self.config.motion_filter.movable_above, current.frame
         aside = self._aside and above > 0
-        # Uncertainty begins with the first keyframes, and learns anew with all of them.
-        anew = self.config.backend.learn or not self.frontend.initialised
-        asked = self._renews or aside or (self.optimiser.begins and anew)
-        movable = self._maps.movable(frame) if asked else None
+        movable = self._movable(frame, aside)
         cells = movable > above if aside and movable is not None else None
         masked = None if frame.mask is None else self._maps.unmasked(frame) < CLOSED
         self._filter.set_aside(current, cells, masked)
         return current if movable is None else replace(current, movable=movable)
+
+    def _movable(self, frame: Frame, aside: bool = False) -> Tensor | None:
+        """What can move in a keyframe, where uncertainty asks, or it is to be set aside."""
+        # Uncertainty begins with the first keyframes, and learns anew with all of them.
+        anew = self.config.backend.learn or not self.frontend.initialised
+        asked = self._renews or aside or (self.optimiser.begins and anew)
+        return self._maps.movable(frame) if asked else None
 
     def _encode(self, frame: Frame) -> Encoded:
         with self.clock("encode"):
@@ -232,7 +241,7 @@ class SlamSystem:
             self._kept[current.frame.index] = payload
 
     def _keyframe(self, current: Encoded, forced: bool) -> bool:
-        number = self._append(current)
+        number = self._keyframes.append(current, *self.frontend.guess(current.frame.time))
         self.events.emit(KeyframeAdded(number, current.frame.index))
         with self.clock("frontend"):
             infos = list(self.store.infos)
@@ -241,32 +250,6 @@ class SlamSystem:
             self.events.emit(KeyframeRemoved(dropped, infos[dropped].index))
         self._filter.settled(current.frame.index, dropped != number)
         return dropped != number
-
-    def _append(self, current: Encoded) -> int:
-        frame, parts, store = current.frame, self.parts, self.store
-        pose, disp = self.frontend.guess(frame.time)
-        features = self._maps.features(frame) if current.features is None else current.features
-        prior = self._maps.prior(frame) if current.prior is None else current.prior
-        pixels = (frame.image.permute(1, 2, 0) * 255.0 + 0.5).clamp(0, 255).byte()
-        info = KeyframeInfo(
-            frame.index, frame.time, frame.name, pixels.cpu().numpy(), current.context
-        )
-        if current.plain is not None:
-            info.whole = current.plain.context, self._maps.unmasked(current.plain.frame)
-        known = {"T_cw": pose, "disps": disp, "features": features, "prior": prior}
-        known["unmasked"] = self._maps.unmasked(frame)
-        movable = current.movable
-        if movable is not None:
-            known["movable"] = movable
-        number = store.append(info, **known)
-        with self.clock("uncertainty"):
-            view = self.optimiser.view()
-            model, begun = parts.uncertainty, self._renews and self.optimiser.begun
-            if begun and isinstance(model, Renews) and movable is not None:
-                model.renew(view, number, movable)
-            model.append(view, number)
-        self.optimiser.upright.see(number)
-        return number
 
     # -- finishing -------------------------------------------------------------------------
 
@@ -292,7 +275,13 @@ class SlamSystem:
         elif not brief:
             with self.clock("global"):
                 self.optimiser.upright.again()
-                backend = Backend(self.optimiser, self.config, self._focal_known, fresh=True)
+                backend = Backend(
+                    self.optimiser,
+                    self.config,
+                    self._focal_known,
+                    fresh=True,
+                    between=self._between(reread),
+                )
                 backend.run(lambda done, total: self.events.emit(Progress("global", done, total)))
                 self._refined(backend.focal)
                 found = replace(found, agreement=backend.agreement)
@@ -325,6 +314,21 @@ class SlamSystem:
             self._newest = None
             if self._filter.ends(verdict, self.store.infos[-1].index):
                 self._keyframe(self._with_movable(self._with_context(current)), forced=True)
+
+    def _between(self, reread: Callable[[], Iterable[Frame]]) -> Between:
+        """What makes keyframes of frames between the others, from a second pass."""
+
+        def encoded(indices: set[int]) -> Iterator[Encoded]:
+            for frame in reread():
+                if frame.index in indices:
+                    current = self._with_context(self._encode(frame))
+                    yield replace(current, movable=self._movable(frame))
+
+        def insert(made: Sequence[tuple[Encoded, dict[str, Tensor]]]) -> None:
+            for number in self._keyframes.insert(made):
+                self.events.emit(KeyframeAdded(number, self.store.infos[number].index))
+
+        return Between(self.optimiser, self.config, self._indices, encoded, insert)
 
     def _reveal(self) -> None:
         """From now on nothing is hidden: matches are made with whole pictures."""

@@ -56,6 +56,7 @@ def uncertainty_model(subject: Subject) -> None:
     if isinstance(part, Renews) and part.renews:
         _renew(subject)
     _state(subject)
+    _between(subject)
 
 
 def _begin(subject: Subject) -> None:
@@ -244,6 +245,46 @@ def _state(subject: Subject) -> None:
         "state",
         same(view.uncertainty, copied.uncertainty),
         "a model restored from state_dict() does not continue as the original",
+    )
+
+
+def _between(subject: Subject) -> None:
+    """A keyframe that comes in between others is not taken for the one whose number it has now."""
+    first, second = subject.build(seed=3), subject.build(seed=4)
+    view = _view(subject, first, 24, torch.float32)
+    with subject.calling("append and update"):
+        three = _of(view, [0, 1, 3], edges=[0, 1, 2, 3])
+        for index in range(3):
+            first.append(_without_edges(three), index)
+        first.update(three)
+    view.uncertainty[[0, 1, 3]] = three.uncertainty
+    for name, value in view.fields.items():
+        value[[0, 1, 3]] = three.fields[name]
+    with subject.calling("append between others, update and load_state_dict"):
+        first.append(_without_edges(view), 2)
+        first.update(view)
+        copied = _of(view, list(range(_N)), edges=list(range(len(view.ii))))
+        second.load_state_dict(snapshot(first.state_dict()))
+        first.update(dataclasses.replace(view, iteration=2))
+        second.update(dataclasses.replace(copied, iteration=2))
+    _maps(subject, view, "after a keyframe came in between others")
+    subject.expect(
+        "between",
+        same(view.uncertainty, copied.uncertainty),
+        "a keyframe came in between others, and what was kept of the one with its number counted",
+    )
+
+
+def _of(view: UncertaintyView, nodes: list[int], edges: list[int]) -> UncertaintyView:
+    """A copy of a view with these keyframes and edges; numbers in `ii` and `jj` stay."""
+    return dataclasses.replace(
+        view,
+        features=view.features[nodes],
+        uncertainty=view.uncertainty[nodes],
+        fields={name: value[nodes] for name, value in view.fields.items()},
+        T_cw=view.T_cw[nodes],
+        disps=view.disps[nodes],
+        **{name: getattr(view, name)[edges] for name in ("ii", "jj", "target", "confidence")},
     )
 
 

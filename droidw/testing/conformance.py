@@ -126,7 +126,7 @@ def check_uncertainty_model(
     >= 0 (`range`) in place and touch `only-asked` keyframes; full and half precision features,
     none at all unless the capability "features" is claimed, confidence with an off-diagonal, no
     confidence and no edges are all taken; `report` is finite; `state`: a model restored from
-    `state_dict()` continues as the original.
+    `state_dict()` continues as the original; so it does after a keyframe came in `between` others.
 
     Raises:
         AssertionError: a clause does not hold.

@@ -226,6 +226,22 @@ def test_uncertainty_faults_are_caught():
             view.uncertainty[view.frames] = float(self.count)
             return UncertaintyReport()
 
+    class Numbering(Constant):
+        """Keeps what it made of a keyframe by its number, though another one may have that now."""
+
+        def __init__(self):
+            self.kept = {}
+
+        def append(self, view, index):
+            view.uncertainty[index] = 1.0
+            self.kept.setdefault(index, float(view.features[index].float().abs().sum()))
+
+        def update(self, view):
+            for k in view.frames.tolist():
+                found = float(view.features[k].float().abs().sum())
+                view.uncertainty[k] = self.kept.get(k, found)
+            return UncertaintyReport()
+
     class Doubled(Constant):
         fields = (StoreField("a", ("h", "w")), StoreField("a", ("c",)))
 
@@ -236,6 +252,7 @@ def test_uncertainty_faults_are_caught():
         ("finite", Dividing),
         ("no-mutation", Spoiling),
         ("state", Forgetful),
+        ("between", Numbering),
         ("fields", Doubled),
     ):
         broken(clause, "uncertainty", component(part))

@@ -59,6 +59,17 @@ def test_remove_moves_every_field(seed):
         assert store.times() == [t / 10 for t in expected]
 
 
+def test_sort_brings_every_field_into_the_order_of_frames():
+    store, rng = empty(), np.random.default_rng(3)
+    for tag in rng.permutation(21) + 1:
+        append(store, int(tag))
+    store.sort()
+    expected = list(range(1, 22))
+    assert all(held == expected for held in tags(store).values())
+    assert [store.payload(k) for k in range(len(store))] == expected
+    assert append(store, 22) == 21
+
+
 def test_every_declared_field_is_covered_above():
     assert set(empty()._declared) == set(FIELDS)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -238,3 +240,39 @@ def test_the_last_pass_is_made_again_until_the_path_has_come_to_rest(
     assert set(heard[3:]) <= {heard[2]}
     assert told[-1] == (expected, expected)
     assert all(done <= total for done, total in told)
+
+
+@pytest.mark.parametrize(
+    ("options", "agreement", "expected"),
+    [
+        ({}, 1.0, [9, 9, 9, 10, 10]),
+        # a pass is held against what was there when it began: it moves nothing
+        ({"passes": [1, 1, 1, 1]}, 1.0, [9, 9, 9, 10]),
+        # no pass goes by the half that fits best
+        ({"passes": [1, 1, 1]}, 1.0, [9, 9, 9]),
+        # an eighth of each picture is hidden
+        ({"between_hidden": 0.2}, 1.0, [9] * 5),
+        # in doubt
+        ({}, 0.5, [9] * 5),
+        ({"restart_below": 0.4}, 0.5, [9, 9, 9, 10, 10]),
+    ],
+)
+def test_keyframes_come_from_between_before_the_last_passes_where_much_is_hidden(
+    broken, monkeypatch, options, agreement, expected
+):
+    backend, _ = broken(**{"passes": [1] * 5, **options})
+    backend.fresh = True
+    store, heard = backend.optimiser.store, []
+    store["unmasked"][: len(store), :1] = 0.0
+
+    def add():
+        if len(store) == 9:
+            store.append(store.infos[-1], **store.values(8))
+
+    backend._between = SimpleNamespace(add=add)
+    monkeypatch.setattr(
+        backend.optimiser, "update", lambda *given, **more: heard.append(len(store))
+    )
+    monkeypatch.setattr(module, "explained_share", lambda *given: agreement)
+    run(backend)
+    assert heard == expected

@@ -220,6 +220,15 @@ def test_nothing_is_made_once_more(backend, options) -> None:
     assert not bool(made.optimiser.store["through"].any())
 
 
+def test_what_was_added_between_is_taken_out_before_the_passes_are_made_once_more(backend) -> None:
+    made, asked = backend()
+    told = []
+    made._between = SimpleNamespace(remove=lambda: told.append(len(asked)))
+    made.run(lambda done, total: None)
+    assert told == [2]
+    assert len(asked) == 4
+
+
 def test_the_focal_length_is_looked_for_again_from_the_given_one(backend, monkeypatch) -> None:
     made, _ = backend()
     store = made.optimiser.store

@@ -13,6 +13,7 @@ from torch import Tensor
 from droidw.errors import ConfigError
 from droidw.interfaces.uncertainty import UncertaintyModel, UncertaintyView
 from droidw.plugin.component import BuildContext
+from droidw.testing import conformance
 from droidw_plugins.uncertainty import _objective as objective
 from droidw_plugins.uncertainty import affine_softplus, mlp, per_pixel
 from droidw_plugins.uncertainty._mlp import Layers, backward, forward
@@ -48,6 +49,12 @@ def test_moving_cells_become_uncertain_and_still_ones_do_not(
     assert float(still.mean()) < 0.6
     assert report.energy < first
     assert 0.4 < report.facts["similar"] < 0.8
+
+
+@EACH
+def test_similarities_are_kept_by_keyframe_and_not_by_number(module: Any) -> None:
+    component = module.COMPONENT
+    conformance.check_uncertainty_model(component, options=component.options(tolerance=0.1))
 
 
 @EACH

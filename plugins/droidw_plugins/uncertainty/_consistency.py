@@ -124,7 +124,7 @@ class Consistency:
             view.fields[_LENGTHS][index] = rows.norm(dim=2)
         if self.options.tolerance > 0:
             serials = view.fields[_SERIAL]
-            number = int(serials[:index].max()) + 1 if index else 1
+            number = int(serials.max()) + 1  # its own is 0 yet
             serials[index] = number
             if self._taken is not None:
                 row = {k: at for k, at in self._taken.row.items() if max(k) < number}

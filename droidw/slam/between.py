@@ -1,0 +1,114 @@
+"""Keyframes from between the others, once poses and depths are known.
+
+Where much of each picture is hidden, more pictures make up for it. While a camera is tracked they
+would have to be told apart by less motion, and a path that begins with a short way has its scale
+from that; once it is known, a frame between two keyframes is measured like any other.
+"""
+
+from __future__ import annotations
+
+import logging
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Iterable, Sequence
+from itertools import islice, pairwise
+from typing import TYPE_CHECKING
+
+import torch
+
+from droidw.slam.filler import Filler
+from droidw.slam.locate import carry_depth
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from droidw.config.schema import DroidwConfig
+    from droidw.slam.motion_filter import Encoded
+    from droidw.slam.optimise import Optimiser
+
+__all__ = ["Between", "chosen"]
+
+_log = logging.getLogger(__name__)
+
+
+def chosen(keyframes: Sequence[int], frames: Sequence[int], most: int) -> list[int]:
+    """Frames between keyframes, in each gap the ones that part it most evenly.
+
+    Args:
+        keyframes: indices of their frames, ascending. frames: of all frames, ascending.
+        most: how many of a gap at most.
+    """
+    found = []
+    for one, other in pairwise(keyframes):
+        inside = frames[bisect_right(frames, one) : bisect_left(frames, other)]
+        count = min(most, len(inside))
+        found += [inside[len(inside) * (2 * k + 1) // (2 * count)] for k in range(count)]
+    return found
+
+
+class Between:
+    """Adds keyframes between those of a store, and takes them out again.
+
+    Args:
+        optimiser: of the run, whose store is added to.
+        config: resolved configuration.
+        indices: of all frames, ascending.
+        encoded: indices -> these frames in turn, as keyframes are made of; some may be missing.
+        insert: makes keyframes of frames, each with these fields of the store, at their places.
+    """
+
+    def __init__(
+        self,
+        optimiser: Optimiser,
+        config: DroidwConfig,
+        indices: Sequence[int],
+        encoded: Callable[[set[int]], Iterable[Encoded]],
+        insert: Callable[[Sequence[tuple[Encoded, dict[str, Tensor]]]], None],
+    ) -> None:
+        self._optimiser = optimiser
+        self._config = config
+        self._indices = indices
+        self._encoded = encoded
+        self._insert = insert
+        self._added: set[int] = set()
+
+    def add(self) -> None:
+        """Make keyframes of frames between those there are, where poses are located from these."""
+        if self._added:
+            return
+        infos = self._optimiser.store.infos
+        before = len(infos)
+        wanted = chosen([info.index for info in infos], self._indices, self._config.backend.between)
+        if not wanted:
+            return
+        filler = Filler(self._optimiser, self._config)
+        made: list[tuple[Encoded, dict[str, Tensor]]] = []
+        pending = iter(self._encoded(set(wanted)))
+        while batch := list(islice(pending, self._config.filler.batch)):
+            for encoded, pose in zip(batch, filler.fill(batch), strict=True):
+                made.append((encoded, self._known(filler, encoded.frame.time, pose)))
+        if made:
+            self._insert(made)
+            self._added.update(encoded.frame.index for encoded, _ in made)
+            _log.info(
+                "much is hidden: %d frames between %d keyframes become keyframes, too "
+                "(backend.between=0 does not)",
+                len(made),
+                before,
+            )
+
+    def remove(self) -> None:
+        """Take out what was added."""
+        store = self._optimiser.store
+        for number in reversed(range(len(store))):
+            if store.infos[number].index in self._added:
+                store.remove(number)
+        self._added.clear()
+
+    def _known(self, filler: Filler, time: float, pose: Tensor) -> dict[str, Tensor]:
+        """Fields of a frame by the nearer keyframe beside it: hardly anything moves in between."""
+        store = self._optimiser.store
+        times = store.times()
+        near = min(filler.neighbours(time), key=lambda k: abs(times[k] - time))
+        T_cw = torch.stack([store.T_cw[near], pose])
+        disp = carry_depth(store.disps[near], T_cw, store.intrinsics)
+        return {"T_cw": pose, "disps": disp, "through": store["through"][near].clone()}

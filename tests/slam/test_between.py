@@ -1,0 +1,122 @@
+"""Keyframes from between the others: which frames, with what, and at which places."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from droidw.config.schema import DroidwConfig
+from droidw.geometry.camera import Grid
+from droidw.geometry.interpolate import interpolate
+from droidw.geometry.se3 import inv, log, mul
+from droidw.slam.between import Between, chosen
+from droidw.slam.optimise import Optimiser, Parts
+from droidw.slam.timing import Stopwatch
+
+GRID, INTRINSICS, EVERY = Grid(8, 12, 8, 3.5), torch.tensor([82.0, 82.0, 47.5, 31.5]), 4
+
+
+@pytest.mark.parametrize(
+    ("keyframes", "most", "expected"),
+    [
+        ([0, 4, 5, 9], 1, [2, 7]),
+        ([0, 4, 5, 9], 2, [1, 3, 6, 8]),
+        ([0, 4, 5, 9], 5, [1, 2, 3, 6, 7, 8]),
+        ([0, 4, 5, 9], 0, []),
+        ([0, 2, 4], 1, [1, 3]),
+        ([3, 4, 5], 1, []),
+        ([4], 1, []),
+        ([], 1, []),
+    ],
+)
+def test_frames_part_each_gap_evenly(keyframes, most, expected) -> None:
+    assert chosen(keyframes, range(12), most) == expected
+
+
+def test_only_frames_that_there_are_become_keyframes() -> None:
+    assert chosen([0, 10, 20], [0, 1, 2, 10, 20, 21], 1) == [2]
+    assert chosen([0, 10, 20], [0, 1, 2, 10, 20, 21], 3) == [1, 2]
+
+
+@pytest.fixture
+def sparse(arc, waves, stored):
+    """A store with every fourth frame of a path, all poses of it, and who adds the others.
+
+    Frames are located halfway between their keyframes, as the filler does without a measurement.
+    """
+
+    def make(missing=(), **options):
+        count = 5
+        store = stored(GRID, INTRINSICS.clone(), arc(count), waves(count, GRID.height, GRID.width))
+        for k, info in enumerate(store.infos):
+            store.infos[k] = SimpleNamespace(**{**vars(info), "index": EVERY * k})
+            store["through"][k] = k
+        config = DroidwConfig()
+        config.filler.updates = 0
+        for name, value in options.items():
+            setattr(config.backend, name, value)
+        optimiser = Optimiser(
+            store, Parts(None, None, None, None, None), config.weighting, Stopwatch()
+        )
+        asked, given = [], []
+
+        def encoded(indices):
+            asked.append(indices)
+            for index in sorted(indices - set(missing)):
+                frame = SimpleNamespace(index=index, time=index / EVERY / 10)
+                yield SimpleNamespace(frame=frame)
+
+        def insert(made):
+            given.append([(one.frame.index, known) for one, known in made])
+            for one, known in made:
+                info = SimpleNamespace(index=one.frame.index, time=one.frame.time)
+                store.append(info, **known)
+            store.sort()
+
+        indices = list(range(EVERY * (count - 1) + 1))
+        return store, Between(optimiser, config, indices, encoded, insert), asked, given
+
+    return make
+
+
+def test_a_frame_has_the_depth_of_the_keyframe_beside_it(sparse) -> None:
+    store, between, _, given = sparse()
+    poses, disps = store.T_cw.clone(), store.disps.clone()
+    between.add()
+    assert [info.index for info in store.infos] == list(range(0, 17, 2))
+    assert torch.equal(store.T_cw[::2], poses)
+    assert torch.equal(store.disps[::2], disps)
+    for k, (index, known) in enumerate(given[0]):
+        assert index == EVERY * k + 2
+        off = log(mul(known["T_cw"], inv(interpolate(poses[k], poses[k + 1], 0.5))))
+        assert float(off.norm()) < 1e-5
+        # Depths of either keyframe look alike from there: a wall with waves.
+        assert float((known["disps"] / disps[k]).log().abs().median()) < 0.2
+        assert known["through"].unique().tolist() in ([k], [k + 1])
+
+
+def test_they_are_added_once_and_taken_out_again(sparse) -> None:
+    store, between, asked, _ = sparse()
+    poses = store.T_cw.clone()
+    between.add()
+    between.add()
+    assert len(asked) == 1
+    assert len(store) == 9
+    between.remove()
+    assert torch.equal(store.T_cw, poses)
+    between.add()
+    assert len(store) == 9
+
+
+@pytest.mark.parametrize(
+    ("options", "missing", "left"),
+    [({"between": 0}, (), 5), ({"between": 3}, (), 17), ({}, (2, 6, 10, 14), 5), ({}, (6,), 8)],
+    ids=["none wanted", "all", "all are lost", "one is lost"],
+)
+def test_as_many_as_wanted_and_readable(sparse, options, missing, left) -> None:
+    store, between, asked, _ = sparse(missing, **options)
+    between.add()
+    assert len(store) == left
+    assert bool(asked) == (options.get("between") != 0)  # nothing is read for nothing
