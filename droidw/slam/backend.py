@@ -6,6 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,7 @@ from droidw.geometry.transfer import upload
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import backend_edges, frontend_edges
 from droidw.interfaces.correspondence import Upsamples
+from droidw.slam.between import inherited
 from droidw.slam.convergence import moved_by
 from droidw.slam.doubt import explained_share
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
@@ -81,6 +83,9 @@ class Backend:
     def run(self, tell: Callable[[int, int], None]) -> int:
         """Make the passes; where much is seen through what seems far away, once more without that.
 
+        Where the path is in doubt in the end, keyframes that came from between others are taken
+        out: what measures it in other ways does so by the keyframes that it was tracked with.
+
         Args:
             tell: called with (update steps done, those in all so far: `more_passes` adds to them).
         Returns:
@@ -100,6 +105,8 @@ class Backend:
             if self._between is not None:
                 self._between.remove()
             graph = self._make(tell)
+        if self._between is not None and self._in_doubt(self.agreement):
+            self._between.remove()
         return 0 if graph is None else len(graph)
 
     def _sees_through(self, graph: FactorGraph) -> bool:
@@ -109,7 +116,7 @@ class Backend:
         # the wrong place.
         if options.seen_through >= 1 or not bool(store["uncertainty"].any()):
             return False
-        if self.optimiser.upright.doubts(self.agreement, options.restart_below):
+        if self._in_doubt(self.agreement):
             return False
         gates = self.optimiser.gates()
         through = moves_ahead(store, graph, gates, options.seen_through)
@@ -203,7 +210,7 @@ class Backend:
         agreement = explained_share(
             self.optimiser.store, graph, graph.select(), self.optimiser.gates()
         )
-        if not self.optimiser.upright.doubts(agreement, options.restart_below):
+        if not self._in_doubt(agreement):
             self._between.add()
 
     def _moves_on(self, before: Path, gates: Tensor) -> bool:
@@ -215,7 +222,7 @@ class Backend:
         options = self.config.backend
         if closed_share(gates) < options.edges_hidden:
             return False
-        if self.optimiser.upright.doubts(self.agreement, options.restart_below):
+        if self._in_doubt(self.agreement):
             return False
         moved = moved_by(before, self.optimiser.store, gates)
         _log.info(
@@ -248,6 +255,10 @@ class Backend:
                 solver = replace(solver, cauchy_tuning=tuning, cauchy_slip=slip)
         return solver
 
+    def _in_doubt(self, agreement: float) -> bool:
+        """Whether what agrees is so little that the path is to be measured in other ways."""
+        return self.optimiser.upright.doubts(agreement, self.config.backend.restart_below)
+
     def _hidden(self) -> float:
         """Share of all cells that are closed, by uncertainty or a mask."""
         return closed_share(self.optimiser.gates())
@@ -277,7 +288,8 @@ class Backend:
         """Directed edges between keyframes, chosen by how far they are apart now.
 
         What is hidden in some pairs of pictures is seen in others: where much is, more pairs tell
-        more. Before a path has come to rest they hold it where it is.
+        more. Before a path has come to rest they hold it where it is. Keyframes from between others
+        share the edges of these.
 
         Args:
             more: as `backend.last_nms` and `backend.last_factors` say.
@@ -286,7 +298,9 @@ class Backend:
         nms, factors = options.nms, options.factors_per_keyframe
         if more:
             nms, factors = min(nms, options.last_nms), max(factors, options.last_factors)
-        count = len(store)
+        old = list(range(len(store))) if self._between is None else self._between.old()
+        at = torch.tensor(old, dtype=torch.int64)
+        count = len(old)
         ii, jj = torch.tril_indices(count, count, -1)
         near = []
         for start in range(0, len(ii), _CHUNK):
@@ -296,29 +310,21 @@ class Backend:
                     store.T_cw,
                     store.disps,
                     store.intrinsics,
-                    upload(ii[part], store.device),
-                    upload(jj[part], store.device),
+                    upload(at[ii[part]], store.device),
+                    upload(at[jj[part]], store.device),
                     options.beta,
                 ).cpu()
             )
         distance = np.full((count, count), np.inf)
         distance[ii.numpy(), jj.numpy()] = torch.cat(near).double().numpy()
-        steps = spans(store["movable"], store["unmasked"], self.config.motion_filter)
+        there = upload(at, store.device)
+        hidden = store["movable"][there], store["unmasked"][there]
+        steps = spans(*hidden, self.config.motion_filter)
         # where keyframes are near to one another, more of them are as far apart as elsewhere
         most = int(factors * (1 / steps).sum())
-        if options.nms_shape == "diamond":
-            return frontend_edges(
-                distance,
-                0,
-                0,
-                (),
-                radius=options.radius,
-                nms=nms,
-                threshold=options.threshold,
-                max_factors=most,
-                spans=steps,
-            )
-        return backend_edges(
+        diamond = options.nms_shape == "diamond"
+        propose = partial(frontend_edges, first_i=0, first_j=0, existing=())
+        found = (propose if diamond else backend_edges)(
             distance,
             radius=options.radius,
             nms=nms,
@@ -326,3 +332,4 @@ class Backend:
             max_factors=most,
             spans=steps,
         )
+        return found if count == len(store) else inherited(found, old, len(store))

@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from droidw.slam.motion_filter import Encoded
     from droidw.slam.optimise import Optimiser
 
-__all__ = ["Between", "chosen"]
+__all__ = ["Between", "chosen", "inherited"]
+
+Pair = tuple[int, int]
 
 _log = logging.getLogger(__name__)
 
@@ -43,6 +45,33 @@ def chosen(keyframes: Sequence[int], frames: Sequence[int], most: int) -> list[i
         count = min(most, len(inside))
         found += [inside[len(inside) * (2 * k + 1) // (2 * count)] for k in range(count)]
     return found
+
+
+def inherited(edges: Sequence[Pair], old: Sequence[int], count: int) -> list[Pair]:
+    """Edges of a graph into which keyframes came, both directions of each pair.
+
+    One that came is linked to its neighbours, and shares the edges of the keyframe before it: if it
+    is alone in its gap every second one, of two every third. So near and far edges stay in
+    proportion. Chosen among all keyframes most would be near ones, which drown the far ones that
+    hold a path together.
+
+    Args:
+        edges: between the keyframes of before, numbered among themselves.
+        old: the numbers that these have now, ascending, from 0 on. count: of all keyframes.
+    """
+    pairs = {(old[i], old[j]) for i, j in edges if i < j}
+    ends: dict[int, list[int]] = {k: [] for k in old}
+    for i, j in sorted(pairs):
+        ends[i].append(j)
+        ends[j].append(i)
+    turn = 0
+    for before, after in pairwise([*old, count]):
+        for new in range(before + 1, after):
+            others = {new - 1, *sorted(ends[before])[turn % (after - before) :: after - before]}
+            others |= {new + 1} if new + 1 < count else set()
+            pairs |= {(min(new, other), max(new, other)) for other in others}
+            turn += 1
+    return [pair for i, j in sorted(pairs) for pair in ((i, j), (j, i))]
 
 
 class Between:
@@ -103,6 +132,11 @@ class Between:
             if store.infos[number].index in self._added:
                 store.remove(number)
         self._added.clear()
+
+    def old(self) -> list[int]:
+        """Numbers of the keyframes that are not from between others."""
+        infos = self._optimiser.store.infos
+        return [k for k, info in enumerate(infos) if info.index not in self._added]
 
     def _known(self, filler: Filler, time: float, pose: Tensor) -> dict[str, Tensor]:
         """Fields of a frame by the nearer keyframe beside it: hardly anything moves in between."""

@@ -262,17 +262,21 @@ def test_keyframes_come_from_between_before_the_last_passes_where_much_is_hidden
 ):
     backend, _ = broken(**{"passes": [1] * 5, **options})
     backend.fresh = True
-    store, heard = backend.optimiser.store, []
+    store, heard, taken_out = backend.optimiser.store, [], []
     store["unmasked"][: len(store), :1] = 0.0
 
     def add():
         if len(store) == 9:
             store.append(store.infos[-1], **store.values(8))
 
-    backend._between = SimpleNamespace(add=add)
+    backend._between = SimpleNamespace(
+        add=add, remove=lambda: taken_out.append(len(heard)), old=lambda: list(range(len(store)))
+    )
     monkeypatch.setattr(
         backend.optimiser, "update", lambda *given, **more: heard.append(len(store))
     )
     monkeypatch.setattr(module, "explained_share", lambda *given: agreement)
     run(backend)
     assert heard == expected
+    # what measures a path in doubt does so by the keyframes that it was tracked with
+    assert taken_out == ([5] if agreement < options.get("restart_below", 0.8) else [])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,7 +12,7 @@ from droidw.config.schema import DroidwConfig
 from droidw.geometry.camera import Grid
 from droidw.geometry.interpolate import interpolate
 from droidw.geometry.se3 import inv, log, mul
-from droidw.slam.between import Between, chosen
+from droidw.slam.between import Between, chosen, inherited
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.timing import Stopwatch
 
@@ -120,3 +121,59 @@ def test_as_many_as_wanted_and_readable(sparse, options, missing, left) -> None:
     between.add()
     assert len(store) == left
     assert bool(asked) == (options.get("between") != 0)  # nothing is read for nothing
+
+
+@pytest.mark.parametrize(
+    ("options", "missing", "expected"),
+    [
+        ({}, (), [0, 2, 4, 6, 8]),
+        ({"between": 3}, (6, 7), [0, 4, 6, 10, 14]),
+        ({"between": 0}, (), [0, 1, 2, 3, 4]),
+    ],
+)
+def test_where_the_others_are_now(sparse, options, missing, expected) -> None:
+    _, between, _, _ = sparse(missing, **options)
+    assert between.old() == [0, 1, 2, 3, 4]
+    between.add()
+    assert between.old() == expected
+    between.remove()
+    assert between.old() == [0, 1, 2, 3, 4]
+
+
+def both_ways(*pairs):
+    return sorted(pair for i, j in pairs for pair in ((i, j), (j, i)))
+
+
+def test_new_keyframes_share_the_edges_of_the_one_before() -> None:
+    edges = both_ways((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
+    found = inherited(edges, [0, 2, 4, 6], 7)
+    kept = [(0, 2), (0, 4), (2, 4), (0, 6), (2, 6), (4, 6)]
+    beside = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (5, 6)]
+    # of 0 the first and third of 2 4 6; of 2 the second of 0 4 6; of 4 the first and third of 0 2 6
+    shared = [(1, 2), (1, 6), (3, 4), (0, 5), (5, 6)]
+    assert sorted(found) == both_ways(*{*kept, *beside, *shared})
+    assert len(set(found)) == len(found)
+
+
+def test_a_gap_without_a_new_one_keeps_its_edges() -> None:
+    edges = both_ways((0, 1), (1, 2), (0, 2))
+    assert sorted(inherited(edges, [0, 1, 2], 3)) == edges
+    found = inherited(edges, [0, 1, 3], 4)
+    assert {(1, 2), (2, 3)} <= set(found)
+    assert sorted(inherited(edges, [0, 1, 2], 4)) == both_ways(
+        (0, 1), (1, 2), (0, 2), (2, 3), (0, 3)
+    )
+
+
+def test_near_and_far_edges_stay_in_proportion() -> None:
+    """Two in each gap, of a chain with links up to four apart."""
+    count = 30
+    edges = [(i, j) for i in range(count) for j in range(count) if 0 < abs(i - j) <= 4]
+    old = list(range(0, 3 * count, 3))
+    found = inherited(edges, old, 3 * count - 2)
+
+    def reach(pairs, step):
+        apart = np.asarray([abs(i - j) / step for i, j in pairs if abs(i - j) > 2])
+        return np.histogram(apart, bins=[0.9, 1.5, 2.5, 3.5, 4.9])[0] / len(apart)
+
+    assert np.abs(reach(found, 3) - reach([(3 * i, 3 * j) for i, j in edges], 3)).max() < 0.06

@@ -223,7 +223,11 @@ def test_nothing_is_made_once_more(backend, options) -> None:
 def test_what_was_added_between_is_taken_out_before_the_passes_are_made_once_more(backend) -> None:
     made, asked = backend()
     told = []
-    made._between = SimpleNamespace(remove=lambda: told.append(len(asked)))
+    made._between = SimpleNamespace(
+        add=lambda: None,
+        remove=lambda: told.append(len(asked)),
+        old=lambda: list(range(COUNT)),
+    )
     made.run(lambda done, total: None)
     assert told == [2]
     assert len(asked) == 4
