@@ -205,7 +205,9 @@ class Backend:
             graph: of the pass before, with what was measured last.
         """
         options = self.config.backend
-        if self._between is None or self._hidden() < options.between_hidden:
+        if self._between is None or options.between == 0:
+            return
+        if self._hidden() < options.between_hidden:
             return
         agreement = explained_share(
             self.optimiser.store, graph, graph.select(), self.optimiser.gates()

@@ -120,9 +120,10 @@ class Between:
             self._added.update(encoded.frame.index for encoded, _ in made)
             _log.info(
                 "much is hidden: %d frames between %d keyframes become keyframes, too "
-                "(backend.between=0 does not)",
+                "(backend.between=%d)",
                 len(made),
                 before,
+                self._config.backend.between,
             )
 
     def remove(self) -> None:

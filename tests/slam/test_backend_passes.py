@@ -248,6 +248,7 @@ def test_the_last_pass_is_made_again_until_the_path_has_come_to_rest(
         ({}, 1.0, [9, 9, 9, 10, 10]),
         # a pass is held against what was there when it began: it moves nothing
         ({"passes": [1, 1, 1, 1]}, 1.0, [9, 9, 9, 10]),
+        ({"between": 0}, 1.0, [9] * 5),
         # no pass goes by the half that fits best
         ({"passes": [1, 1, 1]}, 1.0, [9, 9, 9]),
         # an eighth of each picture is hidden
@@ -260,7 +261,7 @@ def test_the_last_pass_is_made_again_until_the_path_has_come_to_rest(
 def test_keyframes_come_from_between_before_the_last_passes_where_much_is_hidden(
     broken, monkeypatch, options, agreement, expected
 ):
-    backend, _ = broken(**{"passes": [1] * 5, **options})
+    backend, _ = broken(**{"passes": [1] * 5, "between": 1, **options})
     backend.fresh = True
     store, heard, taken_out = backend.optimiser.store, [], []
     store["unmasked"][: len(store), :1] = 0.0

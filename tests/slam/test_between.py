@@ -55,7 +55,7 @@ def sparse(arc, waves, stored):
             store.infos[k] = SimpleNamespace(**{**vars(info), "index": EVERY * k})
             store["through"][k] = k
         config = DroidwConfig()
-        config.filler.updates = 0
+        config.filler.updates, config.backend.between = 0, 1
         for name, value in options.items():
             setattr(config.backend, name, value)
         optimiser = Optimiser(
