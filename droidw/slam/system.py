@@ -241,7 +241,7 @@ class SlamSystem:
             self._kept[current.frame.index] = payload
 
     def _keyframe(self, current: Encoded, forced: bool) -> bool:
-        number = self._keyframes.append(current, *self.frontend.guess(current.frame.time))
+        number = self._append(current)
         self.events.emit(KeyframeAdded(number, current.frame.index))
         with self.clock("frontend"):
             infos = list(self.store.infos)
@@ -250,6 +250,9 @@ class SlamSystem:
             self.events.emit(KeyframeRemoved(dropped, infos[dropped].index))
         self._filter.settled(current.frame.index, dropped != number)
         return dropped != number
+
+    def _append(self, current: Encoded) -> int:
+        return self._keyframes.append(current, *self.frontend.guess(current.frame.time))
 
     # -- finishing -------------------------------------------------------------------------
 
