@@ -207,11 +207,10 @@ class Backend:
         options = self.config.backend
         if self._between is None or options.between == 0:
             return
-        if self._hidden() < options.between_hidden:
+        gates = self.optimiser.gates()
+        if closed_share(gates) < options.between_hidden:
             return
-        agreement = explained_share(
-            self.optimiser.store, graph, graph.select(), self.optimiser.gates()
-        )
+        agreement = explained_share(self.optimiser.store, graph, graph.select(), gates)
         if not self._in_doubt(agreement):
             self._between.add()
 

@@ -208,6 +208,11 @@ class SlamSystem:
         asked = self._renews or aside or (self.optimiser.begins and anew)
         return self._maps.movable(frame) if asked else None
 
+    def _held(self, frame: Frame) -> Encoded:
+        """A frame read again, with what is held of it."""
+        held = self._kept.get(frame.index)
+        return self._encode(frame) if held is None else Encoded(frame, held)
+
     def _encode(self, frame: Frame) -> Encoded:
         with self.clock("encode"):
             return Encoded(frame, self.parts.correspondence.encode(frame, self.grid))
@@ -324,7 +329,7 @@ class SlamSystem:
         def encoded(indices: set[int]) -> Iterator[Encoded]:
             for frame in reread():
                 if frame.index in indices:
-                    current = self._with_context(self._encode(frame))
+                    current = self._with_context(self._held(frame))
                     yield replace(current, movable=self._movable(frame))
 
         def insert(made: Sequence[tuple[Encoded, dict[str, Tensor]]]) -> None:
@@ -372,8 +377,7 @@ class SlamSystem:
         known = set(self._indices)
         for frame in reread():
             if frame.index in known and not filler.is_keyframe(frame.index):
-                held = self._kept.get(frame.index)
-                yield self._encode(frame) if held is None else Encoded(frame, held)
+                yield self._held(frame)
 
     def _records(self) -> tuple[tuple[KeyframeRecord, ...], CloudPoints]:
         store, cloud = self.store, self.config.cloud
