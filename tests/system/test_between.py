@@ -46,6 +46,8 @@ def test_gaps_are_parted_where_much_is_hidden(go, masked):
     for one, new, other in zip(before[:-1], after[1::2], before[1:], strict=True):
         assert abs(new - (one + other) / 2) <= 1
     assert len(ran.poses) == 26
+    read_again = go(*given, "backend.between=1", "filler.cache_mb=0", to="c")
+    assert np.array_equal(read_again.poses, ran.poses)
     assert (
         f"{len(after) - len(before)} frames between {len(before)} keyframes"
         in (ran.folder / "log.txt").read_text()
