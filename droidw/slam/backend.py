@@ -205,7 +205,7 @@ class Backend:
             graph: of the pass before, with what was measured last.
         """
         options = self.config.backend
-        if self._between is None or options.between == 0:
+        if self._between is None or options.between == 0 or self._between.made:
             return
         gates = self.optimiser.gates()
         if closed_share(gates) < options.between_hidden:

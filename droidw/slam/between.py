@@ -100,9 +100,14 @@ class Between:
         self._insert = insert
         self._added: set[int] = set()
 
+    @property
+    def made(self) -> bool:
+        """Whether there are any of those now."""
+        return bool(self._added)
+
     def add(self) -> None:
         """Make keyframes of frames between those there are, where poses are located from these."""
-        if self._added:
+        if self.made:
             return
         infos = self._optimiser.store.infos
         before = len(infos)
