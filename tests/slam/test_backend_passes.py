@@ -267,11 +267,15 @@ def test_keyframes_come_from_between_before_the_last_passes_where_much_is_hidden
     store["unmasked"][: len(store), :1] = 0.0
 
     def add():
-        if len(store) == 9:
-            store.append(store.infos[-1], **store.values(8))
+        assert not between.made
+        between.made = True
+        store.append(store.infos[-1], **store.values(8))
 
-    backend._between = SimpleNamespace(
-        add=add, remove=lambda: taken_out.append(len(heard)), old=lambda: list(range(len(store)))
+    between = backend._between = SimpleNamespace(
+        made=False,
+        add=add,
+        remove=lambda: taken_out.append(len(heard)),
+        old=lambda: list(range(len(store))),
     )
     monkeypatch.setattr(
         backend.optimiser, "update", lambda *given, **more: heard.append(len(store))
