@@ -49,10 +49,10 @@ class BackendConfig:
         le=1,
     )
     between: int = opt(
-        0,
+        1,
         "frames of each gap between keyframes that become keyframes, too, before the passes with "
         "`last_tuning`, if `between_hidden` is reached, but for a path of which less than "
-        "`restart_below` agrees: more pictures, and the longer for it (0: none)",
+        "`restart_below` agrees: by then poses and depths are known",
         ge=0,
     )
     between_hidden: float = opt(

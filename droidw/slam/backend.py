@@ -105,8 +105,11 @@ class Backend:
             if self._between is not None:
                 self._between.remove()
             graph = self._make(tell)
-        if self._between is not None and self._in_doubt(self.agreement):
-            self._between.remove()
+        if self._between is not None and graph is not None:
+            if self._in_doubt(self.agreement):
+                self._between.remove()
+            else:
+                self._between.remove_loose(graph, self.optimiser.gates())
         return 0 if graph is None else len(graph)
 
     def _sees_through(self, graph: FactorGraph) -> bool:
@@ -199,15 +202,18 @@ class Backend:
         return graph
 
     def _add_between(self, graph: FactorGraph) -> None:
-        """More keyframes, where much is hidden and the path is not in doubt.
+        """More keyframes, where much is hidden and the path is not in doubt, less those come loose.
 
         Args:
             graph: of the pass before, with what was measured last.
         """
         options = self.config.backend
-        if self._between is None or options.between == 0 or self._between.made:
+        if self._between is None or options.between == 0:
             return
         gates = self.optimiser.gates()
+        if self._between.made:
+            self._between.remove_loose(graph, gates)
+            return
         if closed_share(gates) < options.between_hidden:
             return
         agreement = explained_share(self.optimiser.store, graph, graph.select(), gates)

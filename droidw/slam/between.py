@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from droidw.slam.doubt import explained_around, explained_share
 from droidw.slam.filler import Filler
 from droidw.slam.locate import carry_depth
 
@@ -22,12 +23,17 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from droidw.config.schema import DroidwConfig
+    from droidw.graph.factors import FactorGraph
     from droidw.slam.motion_filter import Encoded
     from droidw.slam.optimise import Optimiser
 
 __all__ = ["Between", "chosen", "inherited"]
 
 Pair = tuple[int, int]
+
+# A keyframe is loose if less than this share of what agrees all over agrees about it. Of those that
+# sat where they should it was a half and more of that, of one that was off nothing at all.
+_LOOSE = 1 / 3
 
 _log = logging.getLogger(__name__)
 
@@ -83,6 +89,8 @@ class Between:
         indices: of all frames, ascending.
         encoded: indices -> these frames in turn, as keyframes are made of; some may be missing.
         insert: makes keyframes of frames, each with these fields of the store, at their places.
+    Attributes:
+        made: there were frames to add, and what was made of them was not taken out again.
     """
 
     def __init__(
@@ -99,11 +107,7 @@ class Between:
         self._encoded = encoded
         self._insert = insert
         self._added: set[int] = set()
-
-    @property
-    def made(self) -> bool:
-        """Whether there are any of those now."""
-        return bool(self._added)
+        self.made = False
 
     def add(self) -> None:
         """Make keyframes of frames between those there are, where poses are located from these."""
@@ -121,23 +125,48 @@ class Between:
             for encoded, pose in zip(batch, filler.fill(batch), strict=True):
                 made.append((encoded, self._known(filler, encoded.frame.time, pose)))
         if made:
+            self.made = True
             self._insert(made)
             self._added.update(encoded.frame.index for encoded, _ in made)
             _log.info(
                 "much is hidden: %d frames between %d keyframes become keyframes, too "
-                "(backend.between=%d)",
+                "(backend.between=0 does not)",
                 len(made),
                 before,
-                self._config.backend.between,
             )
 
     def remove(self) -> None:
         """Take out what was added."""
+        self._take_out(self._numbers())
+        self.made = False
+
+    def remove_loose(self, graph: FactorGraph, gates: Tensor) -> None:
+        """Take out those about which next to nothing agrees: poses and depths came loose.
+
+        Args:
+            graph: of the last pass, with keyframes as they are now, and what was measured.
+            gates: [N,h,w] in [0,1] of all keyframes.
+        """
+        if not self.made:
+            return
+        store, rows = self._optimiser.store, graph.select()
+        least = _LOOSE * explained_share(store, graph, rows, gates)
+        agrees = explained_around(store, graph, rows, gates).tolist()
+        loose = [k for k in self._numbers() if agrees[k] < least]
+        for k in loose:
+            _log.info("frame %d is no keyframe any more: it came loose", store.infos[k].index)
+        self._take_out(loose)
+
+    def _numbers(self) -> list[int]:
+        """Numbers of the keyframes from between others."""
+        infos = self._optimiser.store.infos
+        return [k for k, info in enumerate(infos) if info.index in self._added]
+
+    def _take_out(self, numbers: Sequence[int]) -> None:
         store = self._optimiser.store
-        for number in reversed(range(len(store))):
-            if store.infos[number].index in self._added:
-                store.remove(number)
-        self._added.clear()
+        for number in reversed(numbers):
+            self._added.remove(store.infos[number].index)
+            store.remove(number)
 
     def old(self) -> list[int]:
         """Numbers of the keyframes that are not from between others."""

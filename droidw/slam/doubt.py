@@ -15,7 +15,14 @@ if TYPE_CHECKING:
     from droidw.graph.factors import FactorGraph
     from droidw.graph.store import KeyframeStore
 
-__all__ = ["doubtful", "explained_reach", "explained_share", "explained_weight", "scatter"]
+__all__ = [
+    "doubtful",
+    "explained_around",
+    "explained_reach",
+    "explained_share",
+    "explained_weight",
+    "scatter",
+]
 
 # Distance of measured and predicted place, in cells, at which they agree by half.
 _SCALE = 0.2
@@ -55,6 +62,25 @@ def explained_weight(
         rows, gates: as of `explained_share`.
     """
     return agreeing_weight(*_apart(store, graph, rows, gates), _SCALE).sum((1, 2))
+
+
+def explained_around(
+    store: KeyframeStore, graph: FactorGraph, rows: list[int], gates: Tensor
+) -> Tensor:
+    """Share in [0,1] of what the edges of each keyframe measured that agrees, [N] on the CPU.
+
+    Of those from it and to it; 0 of a keyframe about which nothing was measured.
+
+    Args:
+        rows, gates: as of `explained_share`.
+    """
+    apart, weight = _apart(store, graph, rows, gates)
+    agreeing = agreeing_weight(apart, weight, _SCALE).sum((1, 2)).cpu()
+    measured = agreeing_weight(0 * apart, weight, _SCALE).sum((1, 2)).cpu()
+    totals = agreeing.new_zeros(2, len(store))
+    for ends in graph.index(rows):
+        totals.index_add_(1, ends.cpu(), torch.stack([agreeing, measured]))
+    return totals[0] / totals[1].clamp_min(1e-6)
 
 
 def explained_reach(

@@ -35,8 +35,7 @@ RUNS = {
         *FLOW, "frontend.starts=true", "camera.refine_focal=true", "input.max_frames=8",
     ),
     "keyframes from between": (
-        *FLOW, "backend.between=1", "backend.between_hidden=0", "backend.restart_below=0",
-        "backend.passes=[1, 1, 1, 1]",
+        *FLOW, "backend.between_hidden=0", "backend.restart_below=0", "backend.passes=[1, 1, 1, 1]",
     ),
     "no parts": (*FLOW, "features=none", "uncertainty=none"),
     "per-pixel": (*FLOW, "uncertainty=per-pixel"),

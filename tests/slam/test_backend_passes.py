@@ -263,7 +263,7 @@ def test_keyframes_come_from_between_before_the_last_passes_where_much_is_hidden
 ):
     backend, _ = broken(**{"passes": [1] * 5, "between": 1, **options})
     backend.fresh = True
-    store, heard, taken_out = backend.optimiser.store, [], []
+    store, heard, taken_out, looked = backend.optimiser.store, [], [], []
     store["unmasked"][: len(store), :1] = 0.0
 
     def add():
@@ -275,6 +275,7 @@ def test_keyframes_come_from_between_before_the_last_passes_where_much_is_hidden
         made=False,
         add=add,
         remove=lambda: taken_out.append(len(heard)),
+        remove_loose=lambda graph, gates: looked.append(len(heard)),
         old=lambda: list(range(len(store))),
     )
     monkeypatch.setattr(
@@ -284,4 +285,8 @@ def test_keyframes_come_from_between_before_the_last_passes_where_much_is_hidden
     run(backend)
     assert heard == expected
     # what measures a path in doubt does so by the keyframes that it was tracked with
-    assert taken_out == ([5] if agreement < options.get("restart_below", 0.8) else [])
+    doubted = agreement < options.get("restart_below", 0.8)
+    assert taken_out == ([5] if doubted else [])
+    # and what came loose is looked for after each pass with them
+    came = expected.index(10) + 1 if 10 in expected else len(expected)
+    assert looked == ([] if doubted else list(range(came, len(expected) + 1)))

@@ -11,7 +11,9 @@ import torch
 from droidw.config.schema import DroidwConfig
 from droidw.geometry.camera import Grid
 from droidw.geometry.interpolate import interpolate
+from droidw.geometry.projective import reproject
 from droidw.geometry.se3 import inv, log, mul
+from droidw.graph.factors import FactorGraph
 from droidw.slam.between import Between, chosen, inherited
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.timing import Stopwatch
@@ -55,7 +57,7 @@ def sparse(arc, waves, stored):
             store.infos[k] = SimpleNamespace(**{**vars(info), "index": EVERY * k})
             store["through"][k] = k
         config = DroidwConfig()
-        config.filler.updates, config.backend.between = 0, 1
+        config.filler.updates = 0
         for name, value in options.items():
             setattr(config.backend, name, value)
         optimiser = Optimiser(
@@ -109,6 +111,56 @@ def test_they_are_added_once_and_taken_out_again(sparse) -> None:
     assert torch.equal(store.T_cw, poses)
     between.add()
     assert len(store) == 9
+
+
+@pytest.mark.parametrize(
+    ("moved", "unmeasured", "left"),
+    [
+        ((), (), [0, 2, 4, 6, 8, 10, 12, 14, 16]),
+        ((3,), (), [0, 2, 4, 8, 10, 12, 14, 16]),
+        ((1, 5), (), [0, 4, 6, 8, 12, 14, 16]),
+        # those that were there before stay, whatever became of them
+        ((4,), (), [0, 2, 4, 6, 8, 10, 12, 14, 16]),
+        ((), (7,), [0, 2, 4, 6, 8, 10, 12, 16]),
+    ],
+    ids=["none", "one", "two", "an old one", "nothing was measured about it"],
+)
+def test_what_came_loose_is_taken_out(sparse, moved, unmeasured, left) -> None:
+    store, between, asked, _ = sparse()
+    between.add()
+    count = len(store)
+    graph = FactorGraph(GRID.height, GRID.width)
+    graph.add([(i, j) for i in range(count) for j in range(count) if i != j])
+    rows = graph.select()
+    ii, jj = graph.index(rows)
+    place, _ = reproject(store.T_cw, store.disps, store.intrinsics, ii, jj)
+    confidence = torch.ones(len(rows), GRID.height, GRID.width, 3)
+    for k in unmeasured:
+        confidence[(ii == k) | (jj == k)] = 0.0
+    graph.record(rows, place, confidence)
+    for k in moved:
+        store.T_cw[k, 0] += 1.0
+    between.remove_loose(graph, torch.ones(count, GRID.height, GRID.width))
+    assert [info.index for info in store.infos] == left
+    assert [left[k] for k in between.old()] == [0, 4, 8, 12, 16]
+    between.add()  # what came loose once would do so again
+    assert [info.index for info in store.infos] == left
+    between.remove()
+    assert len(store) == 5
+    between.add()
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("missing", [(), (2, 6, 10, 14)], ids=["not asked yet", "none came"])
+def test_where_none_are_from_between_none_is_loose(sparse, missing) -> None:
+    store, between, _, _ = sparse(missing)
+    if missing:
+        between.add()
+    assert not between.made
+    between.remove_loose(
+        FactorGraph(GRID.height, GRID.width), torch.ones(5, GRID.height, GRID.width)
+    )
+    assert len(store) == 5
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
 from droidw.graph.factors import FactorGraph
 from droidw.graph.store import KeyframeInfo, KeyframeStore
-from droidw.slam.doubt import explained_reach, explained_share
+from droidw.slam.doubt import explained_around, explained_reach, explained_share
 from droidw.slam.frontend import Frontend
 
 H, W = 6, 8
@@ -50,6 +50,30 @@ def test_share_is_that_of_confidence_times_gate(measured):
     assert explained_share(store, graph, [0, 1], gates) == pytest.approx((1 + 0.25) / 1.5)
     gates[:, :, : W // 2] = 0.0
     assert explained_share(store, graph, [0, 1], gates) == pytest.approx(0.5)
+
+
+def test_share_around_a_keyframe_is_that_of_its_edges(measured):
+    store, graph, gates = measured
+    info = KeyframeInfo(2, 0.2, "", np.zeros((48, 64, 3), np.uint8), None)
+    store.append(info, T_cw=torch.tensor([0.2, 0, 0, 0, 0, 0, 1]))
+    gates = torch.cat([gates, gates[:1]])
+    assert explained_around(store, graph, [0, 1], gates).tolist() == pytest.approx([1, 1, 0])
+    graph.add([(1, 2), (2, 1)])
+    place, _ = reproject(store.T_cw, store.disps, store.intrinsics, *graph.index([2, 3]))
+    graph.record([2, 3], place + torch.tensor([0.2, 0.0]), torch.ones(2, H, W, 3))  # agree by half
+    rows = [0, 1, 2, 3]
+    around = explained_around(store, graph, rows, gates)
+    assert around[0] == pytest.approx(1.0)
+    assert 0.5 < around[1] < 1.0
+    assert around[2] == pytest.approx(0.5)
+    # what was not measured does not count
+    confidence = graph.confidence.clone()
+    confidence[3] = float("nan")
+    graph.record(rows, graph.target.clone(), confidence)
+    assert explained_around(store, graph, rows, gates)[2] == pytest.approx(0.5)
+    confidence[2] = 0.0
+    graph.record(rows, graph.target.clone(), confidence)
+    assert explained_around(store, graph, rows, gates).tolist() == pytest.approx([1, 1, 0])
 
 
 def test_what_is_broken_or_not_there_does_not_count(measured):

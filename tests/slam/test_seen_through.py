@@ -226,6 +226,7 @@ def test_what_was_added_between_is_taken_out_before_the_passes_are_made_once_mor
     made._between = SimpleNamespace(
         add=lambda: None,
         remove=lambda: told.append(len(asked)),
+        remove_loose=lambda graph, gates: None,
         old=lambda: list(range(COUNT)),
     )
     made.run(lambda done, total: None)

@@ -1,4 +1,4 @@
-"""`backend.between`: where much is hidden, frames between keyframes become keyframes, too."""
+"""Where much is hidden, frames between keyframes become keyframes, too."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def keyframes(ran):
 def test_gaps_are_parted_where_much_is_hidden(go, masked):
     folder, masks = masked
     given = (folder, "--masks", masks, *SPARSE, "backend.restart_below=0")
-    before, count = keyframes(go(*given, to="a"))
+    before, count = keyframes(go(*given, "backend.between=0", to="a"))
     assert count == len(before)
-    ran = go(*given, "backend.between=1", to="b")
+    ran = go(*given, to="b")
     after, count = keyframes(ran)
     assert count == len(after)
     assert after == sorted(after)
@@ -58,6 +58,6 @@ def test_gaps_are_parted_where_much_is_hidden(go, masked):
 def test_and_nowhere_else(go, masked, hides):
     folder, masks = masked
     more = ("--masks", masks, "backend.between_hidden=0.3") if hides else ()
-    before, _ = keyframes(go(folder, *more, *SPARSE, to="a"))
-    after, _ = keyframes(go(folder, *more, *SPARSE, "backend.between=1", to="b"))
+    before, _ = keyframes(go(folder, *more, *SPARSE, "backend.between=0", to="a"))
+    after, _ = keyframes(go(folder, *more, *SPARSE, to="b"))
     assert after == before
