@@ -147,7 +147,7 @@ class Backend:
         while passes:
             part = passes.popleft()
             if part.kernel == "narrowest" and graph is not None:
-                self._add_between(graph)
+                self._tend_between(graph)
             before = Path.of(store) if again > 0 and not passes else None
             learns = self.fresh and options.learn and part.learns
             if learns and not anew:
@@ -201,8 +201,8 @@ class Backend:
                 self._upsample(session, shown)
         return graph
 
-    def _add_between(self, graph: FactorGraph) -> None:
-        """More keyframes, where much is hidden and the path is not in doubt, less those come loose.
+    def _tend_between(self, graph: FactorGraph) -> None:
+        """Add keyframes where much is hidden and the path not in doubt; later, take out loose ones.
 
         Args:
             graph: of the pass before, with what was measured last.
