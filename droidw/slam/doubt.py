@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.linalg import vector_norm
 
 from droidw.geometry.projective import pixel_grid, reproject
-from droidw.solve.weights import agreeing_share, agreeing_weight
+from droidw.solve.weights import agreeing_and_known, agreeing_share, agreeing_weight
 
 if TYPE_CHECKING:
     from droidw.graph.factors import FactorGraph
@@ -74,12 +74,11 @@ def explained_around(
     Args:
         rows, gates: as of `explained_share`.
     """
-    apart, weight = _apart(store, graph, rows, gates)
-    agreeing = agreeing_weight(apart, weight, _SCALE).sum((1, 2)).cpu()
-    measured = agreeing_weight(0 * apart, weight, _SCALE).sum((1, 2)).cpu()
-    totals = agreeing.new_zeros(2, len(store))
+    parts = agreeing_and_known(*_apart(store, graph, rows, gates), _SCALE)
+    edges = torch.stack(parts).sum((2, 3)).cpu()
+    totals = edges.new_zeros(2, len(store))
     for ends in graph.index(rows):
-        totals.index_add_(1, ends.cpu(), torch.stack([agreeing, measured]))
+        totals.index_add_(1, ends.cpu(), edges)
     return totals[0] / totals[1].clamp_min(1e-6)
 
 

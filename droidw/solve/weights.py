@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CLOSED",
     "GateKind",
+    "agreeing_and_known",
     "agreeing_share",
     "agreeing_weight",
     "closed_share",
@@ -215,7 +216,7 @@ def agreeing_share(residual: Tensor, weight: Tensor, scale: float, nothing: floa
     Returns:
         A scalar on the device.
     """
-    left, known = _agreeing(residual, weight, scale)
+    left, known = agreeing_and_known(residual, weight, scale)
     agreeing, total = left.sum(), known.sum()
     return torch.where(total > 0, agreeing / total.clamp_min(1e-6), nothing)
 
@@ -226,7 +227,7 @@ def agreeing_weight(residual: Tensor, weight: Tensor, scale: float) -> Tensor:
     Args:
         residual, weight, scale: as of `agreeing_share`.
     """
-    return _agreeing(residual, weight, scale)[0]
+    return agreeing_and_known(residual, weight, scale)[0]
 
 
 def closed_share(gates: Tensor) -> float:
@@ -234,8 +235,12 @@ def closed_share(gates: Tensor) -> float:
     return float((gates < CLOSED).float().mean())
 
 
-def _agreeing(residual: Tensor, weight: Tensor, scale: float) -> tuple[Tensor, Tensor]:
-    """What is left of each weight, and the weight itself; both 0 where nothing was measured."""
+def agreeing_and_known(residual: Tensor, weight: Tensor, scale: float) -> tuple[Tensor, Tensor]:
+    """What is left of each weight, and the weight itself; both 0 where nothing was measured.
+
+    Args:
+        residual, weight, scale: as of `agreeing_share`.
+    """
     known = torch.isfinite(residual) & torch.isfinite(weight)
     weight = torch.where(known, weight, 0.0)
     apart = torch.where(known, residual, 0.0)
