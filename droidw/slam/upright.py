@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from droidw.geometry.se3 import from_matrix, inv, rotation
+from droidw.geometry.se3 import from_matrix, inv, mul, rotation
 from droidw.geometry.transfer import upload
 from droidw.interfaces.correspondence import FindsLines
 from droidw.slam.doubt import doubtful
@@ -43,6 +43,8 @@ _KNOWN = 0.6
 # Share of all cells that are closed, from which lines that did not count are asked once more: where
 # nothing is hidden, all keyframes say what the first ones said.
 _HIDDEN = 0.05
+# How many keyframes there are when they are asked again for the first time, a power of two.
+_AGAIN = 16
 
 
 class Upright:
@@ -51,7 +53,8 @@ class Upright:
     Whether a scene has lines along three directions at right angles is decided when tracking
     begins, by the first keyframes: half of them must have `least_share` of the length of their
     lines along these. It is decided anew before global adjustment, by all of them, when it is known
-    what moves. Where a scene has no such lines, nothing here does anything.
+    what moves; and where they did not count though much is hidden, whenever there are twice as many
+    keyframes. Where a scene has no such lines, nothing here does anything.
 
     Args:
         store: has the fields `axes` and `axes_information`.
@@ -83,9 +86,11 @@ class Upright:
 
     def see(self, number: int) -> None:
         """Find the lines of a keyframe just appended, and turn it as they say."""
-        if self.holds is False:
-            return
         store = self._store
+        if self.holds is False:
+            if _due(len(store)):
+                self.again()
+            return
         with self._clock("lines"):
             self._look(number)
             if self.holds is None:
@@ -93,7 +98,10 @@ class Upright:
             known = self._known()
             expected = rotation(store.T_cw[number].double()) @ self._world(known)
             near = [expected.cpu().numpy()]
-            near += [store["axes"][known[-1]].cpu().numpy()] if known else []
+            if known:  # poses may have drifted against the world, but hardly since then
+                beside = min(known, key=lambda k: abs(k - number))
+                since = mul(store.T_cw[number].double(), inv(store.T_cw[beside].double()))
+                near.append((rotation(since) @ store["axes"][beside]).cpu().numpy())
             self._keep(
                 number, next_axes(self._rays(self._lines(number), self._gates(number)[0]), near)
             )
@@ -295,3 +303,8 @@ class Upright:
         store = self._store
         store["axes"][number] = upload(torch.from_numpy(axes.turn), store.device)
         store["axes_information"][number] = upload(torch.from_numpy(axes.information), store.device)
+
+
+def _due(count: int) -> bool:
+    """Whether lines that do not count are asked again with so many keyframes."""
+    return count >= _AGAIN and count & (count - 1) == 0

@@ -196,6 +196,31 @@ def hidden(share):
     return gates
 
 
+@pytest.mark.parametrize(("share", "counts"), [(0.2, True), (0.0, False)])
+def test_lines_that_come_into_sight_count_while_tracking_goes_on(build, share, counts):
+    """Where much is hidden; elsewhere the first keyframes have said what there is to say."""
+    count, random = 17, np.random.default_rng(0)
+    true = poses(count)
+    lines = askew(5) + [lines_of(pose, random) for pose in true[5:]]
+
+    def gates(first):
+        found = torch.ones(len(store) - first, GRID.height, GRID.width)
+        found[:, : round(share * GRID.height)] = 0.0
+        return found
+
+    upright, store, append, _ = build(lines=lines, gates=gates)
+    drift = turn(0.04, 0.02, -0.03).float()
+    for number, pose in enumerate(true):
+        append(number, se3.mul(drift, pose) if number > 5 else pose)
+        if number == 4:
+            upright.begin()
+            assert upright.holds is False
+        assert upright.holds is None or upright.holds == (counts and number >= 15)
+    # what has drifted is turned back, and what comes later is turned as the rest
+    off = apart(store.T_cw[6:], true[6:])
+    assert off.tolist() == pytest.approx([0.0 if counts else 3.085] * len(off), abs=0.1)
+
+
 def half_askew():
     """Lines along the axes in the right half of each picture, and of no direction in the left."""
     random = np.random.default_rng(2)

@@ -121,6 +121,29 @@ def test_the_next_picture_is_looked_for_near_the_last():
     assert next_axes(rays, []) is None
 
 
+def door(degrees, count, walls):
+    """Lines of a door that stands open by so much, and as many of the wall behind it."""
+    ajar = seen(TURN @ turned(0, degrees, 0), count=count, noise=0.05, seed=3)
+    return LineRays(np.concatenate([ajar, seen(TURN, count=walls, noise=0.05, seed=4)]), INTRINSICS)
+
+
+@pytest.mark.parametrize("degrees", [9, 15, 46])
+def test_an_open_door_does_not_lead_a_camera_away(degrees):
+    rays = door(degrees, 24, 12)
+    alone = rays.candidates()[0]
+    assert angle(named_like(alone, TURN), TURN) > 5
+    found = next_axes(rays, [turned(0.5, 1, -0.5) @ TURN])
+    assert angle(found.turn, TURN) < 1.5
+
+
+def test_nothing_but_a_door_is_followed_as_far_as_a_camera_turns():
+    near = turned(1, 0, 1) @ TURN
+    turn = TURN @ turned(0, 12, 0)
+    assert angle(next_axes(LineRays(seen(turn), INTRINSICS), [near]).turn, turn) < 0.1
+    found = next_axes(door(46, 24, 0), [near])
+    assert angle(found.turn, near) < 21
+
+
 def test_pictures_in_turn_have_the_same_names_and_outvote_one_that_is_misled():
     turns = [turned(0, 4 * k, 0) @ TURN for k in range(8)]
     pictures = [LineRays(seen(turn, noise=0.1, seed=k), INTRINSICS) for k, turn in enumerate(turns)]
