@@ -104,6 +104,14 @@ class BackendConfig:
         ge=0,
         le=1,
     )
+    broken_below: float = opt(
+        0.15,
+        "agreement of the matches across some place between two keyframes below which the path has "
+        "broken there: it is in doubt, and tracked backwards, however much agrees in all; of two "
+        "ways one that has not broken is kept (0: never)",
+        ge=0,
+        le=1,
+    )
     splice: bool = opt(True, "of the way that agrees less, take the pieces in which more agrees")
     restart_below: float = opt(
         0.8,

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from droidw.config.resolve import ResolvedConfig
     from droidw.interfaces.datasets import FrameSource
+    from droidw.slam.doubt import Link
     from droidw.slam.records import Outcome
     from droidw.slam.timing import Stopwatch
 
@@ -125,6 +126,13 @@ def told(reports: Mapping[str, int]) -> list[str]:
     ]
 
 
+def _facts_of_link(link: Link) -> dict[str, Any] | None:
+    """Where the path hangs together least."""
+    if math.isnan(link.share):
+        return None
+    return {"frame": link.frame, "agreement": round(link.share, 4)}
+
+
 def facts_of_tracking(source: FrameSource, outcome: Outcome) -> dict[str, Any]:
     """How much was read and tracked, and with which working camera."""
     camera, agreement = outcome.camera, outcome.diagnosis.agreement
@@ -133,6 +141,7 @@ def facts_of_tracking(source: FrameSource, outcome: Outcome) -> dict[str, Any]:
         "last_frame": outcome.last_index,
         "keyframes": len(outcome.keyframes),
         "agreement": None if math.isnan(agreement) else round(agreement, 4),
+        "weakest": _facts_of_link(outcome.diagnosis.weakest),
         "backwards": round(outcome.diagnosis.backwards, 4),
         "skipped": source.skipped,
         "problems": source.problems[:100],

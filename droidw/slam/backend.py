@@ -19,7 +19,7 @@ from droidw.graph.proximity import backend_edges, frontend_edges
 from droidw.interfaces.correspondence import Upsamples
 from droidw.slam.between import inherited
 from droidw.slam.convergence import moved_by
-from droidw.slam.doubt import explained_share
+from droidw.slam.doubt import Link, explained_share, weakest_link
 from droidw.slam.focal import MIN_KEYFRAMES, FocalSearch, refine_focal
 from droidw.slam.motion_filter import spans
 from droidw.slam.passes import all_passes
@@ -57,6 +57,7 @@ class Backend:
         passes: those that `run` makes.
         focal: what the search for a better focal length found, None without one.
         agreement: share of what was measured last that agrees with poses and depths; NaN before.
+        weakest: where least of that agrees.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Backend:
         self._between = between
         self.focal: FocalSearch | None = None
         self.agreement = float("nan")
+        self.weakest = Link()
 
     def run(self, tell: Callable[[int, int], None]) -> int:
         """Make the passes; where much is seen through what seems far away, once more without that.
@@ -106,7 +108,7 @@ class Backend:
                 self._between.remove()
             graph = self._make(tell)
         if self._between is not None and graph is not None:
-            if self._in_doubt(self.agreement):
+            if self._in_doubt():
                 self._between.remove()
             else:
                 self._between.remove_loose(graph, self.optimiser.gates())
@@ -119,7 +121,7 @@ class Backend:
         # the wrong place.
         if options.seen_through >= 1 or not bool(store["uncertainty"].any()):
             return False
-        if self._in_doubt(self.agreement):
+        if self._in_doubt():
             return False
         gates = self.optimiser.gates()
         through = moves_ahead(store, graph, gates, options.seen_through)
@@ -192,7 +194,7 @@ class Backend:
             if passes:
                 continue
             gates = self.optimiser.gates()
-            self.agreement = explained_share(store, graph, graph.select(), gates)
+            self._judge(graph, gates)
             if before is not None and self._moves_on(before, gates):
                 again -= 1
                 total += part.updates
@@ -216,8 +218,8 @@ class Backend:
             return
         if closed_share(gates) < options.between_hidden:
             return
-        agreement = explained_share(self.optimiser.store, graph, graph.select(), gates)
-        if not self._in_doubt(agreement):
+        self._judge(graph, gates)
+        if not self._in_doubt():
             self._between.add()
 
     def _moves_on(self, before: Path, gates: Tensor) -> bool:
@@ -229,7 +231,7 @@ class Backend:
         options = self.config.backend
         if closed_share(gates) < options.edges_hidden:
             return False
-        if self._in_doubt(self.agreement):
+        if self._in_doubt():
             return False
         moved = moved_by(before, self.optimiser.store, gates)
         _log.info(
@@ -262,9 +264,18 @@ class Backend:
                 solver = replace(solver, cauchy_tuning=tuning, cauchy_slip=slip)
         return solver
 
-    def _in_doubt(self, agreement: float) -> bool:
-        """Whether what agrees is so little that the path is to be measured in other ways."""
-        return self.optimiser.upright.doubts(agreement, self.config.backend.restart_below)
+    def _judge(self, graph: FactorGraph, gates: Tensor) -> None:
+        """Find out how much agrees of what was measured last, in all and where it is least."""
+        measured = self.optimiser.store, graph, graph.select(), gates
+        self.agreement = explained_share(*measured)
+        self.weakest = weakest_link(*measured)
+
+    def _in_doubt(self) -> bool:
+        """Whether so little agreed last that the path is to be measured in other ways."""
+        options, doubts = self.config.backend, self.optimiser.upright.doubts
+        return doubts(self.agreement, options.restart_below) or self.weakest.broken(
+            options.broken_below
+        )
 
     def _hidden(self) -> float:
         """Share of all cells that are closed, by uncertainty or a mask."""

@@ -48,7 +48,9 @@ def doubted(
 ) -> Diagnosis:
     """Where too little of what a run measured agrees, let it have what a second look finds better.
 
-    What is too little is less where lines hold the path (`Upright.doubt`). Where not quite too
+    What is too little is less where lines hold the path (`Upright.doubts`). Where next to nothing
+    agrees across some interval between keyframes the path has broken there, however much agrees
+    elsewhere. Where not quite too
     little agrees, pieces that points contradict set out anew first: a path in the wrong valley
     agrees with itself, so it is the one they leave that is to be judged. Then the way there is
     adjusted once more, by the measurements that doubt asks for. The way back is kept if more of
@@ -63,21 +65,18 @@ def doubted(
         What to say of what is kept.
     """
     options, doubts = config.backend, optimiser.upright.doubts
-    in_doubt = doubts(found.agreement, options.backwards_below)
+    broken = found.weakest.broken(options.broken_below)
+    in_doubt = broken or doubts(found.agreement, options.backwards_below)
     if not in_doubt and not doubts(found.agreement, options.restart_below):
         return found
-    look = _SecondLook(optimiser, config, found.agreement, events, stopped)
+    look = _SecondLook(optimiser, config, found, events, stopped)
     optimiser.doubtful = True
     try:
         with optimiser.clock("backwards"):
             if not in_doubt:
                 look.set_out_anew()
-            if doubts(look.kept.agreement, options.backwards_below):
-                _log.info(
-                    "%.0f %% of what was measured agrees with poses and depths: tracking the "
-                    "keyframes backwards (backend.backwards_below=0 does not)",
-                    100 * look.kept.agreement,
-                )
+            if in_doubt or doubts(look.kept.agreement, options.backwards_below):
+                _log_why(look.kept, options.broken_below)
                 look.run()
     except _Stopped:
         pass
@@ -87,7 +86,31 @@ def doubted(
     finally:
         optimiser.doubtful, optimiser.points = False, None
     look.kept.write_to(optimiser.store)
-    return replace(found, agreement=look.kept.agreement, backwards=look.share)
+    kept = look.kept
+    return replace(
+        found,
+        agreement=kept.agreement,
+        weakest=kept.weakest,
+        broken=kept.weakest.broken(options.broken_below),
+        backwards=look.share,
+    )
+
+
+def _log_why(path: Path, broken_below: float) -> None:
+    """Say why keyframes are tracked backwards."""
+    if path.weakest.broken(broken_below):
+        _log.info(
+            "%.0f %% of what was measured across frame %d agrees with poses and depths, the path "
+            "has broken there: tracking the keyframes backwards (backend.broken_below=0 does not)",
+            100 * path.weakest.share,
+            path.weakest.frame,
+        )
+    else:
+        _log.info(
+            "%.0f %% of what was measured agrees with poses and depths: tracking the keyframes "
+            "backwards (backend.backwards_below=0 does not)",
+            100 * path.agreement,
+        )
 
 
 class _SecondLook:
@@ -102,13 +125,13 @@ class _SecondLook:
         self,
         optimiser: Optimiser,
         config: DroidwConfig,
-        agreement: float,
+        found: Diagnosis,
         events: Dispatcher,
         stopped: Callable[[], bool],
     ) -> None:
         self.optimiser = optimiser
         self.config = config
-        self.kept = Path.of(optimiser.store, agreement)
+        self.kept = Path.of(optimiser.store, found.agreement, found.weakest)
         self.share = 0.0
         self._events = events
         self._stopped = stopped
@@ -149,7 +172,7 @@ class _SecondLook:
         )
         if back is None:
             return
-        better = back.agreement > there.agreement
+        better = self._worth(back) > self._worth(there)
         _log.info(
             "%.0f %% agrees, measured once more; %.0f %% backwards%s",
             100 * there.agreement,
@@ -162,6 +185,10 @@ class _SecondLook:
         if self._finishes:
             self._finish()
         self._events.emit(Progress("backwards", self._total, self._total))
+
+    def _worth(self, path: Path) -> tuple[bool, float]:
+        """What is to be larger: one that has not broken comes before one that has."""
+        return not path.weakest.broken(self.config.backend.broken_below), path.agreement
 
     def _splice(self, other: Path) -> None:
         """Take the pieces of another path in which it agrees more."""
@@ -271,7 +298,7 @@ class _SecondLook:
         )
         backend = Backend(self.optimiser, config, motion_prior=motion_prior, passes=passes)
         backend.run(lambda done, _: self._tell(before + done, self._total))
-        return Path.of(self.optimiser.store, backend.agreement)
+        return Path.of(self.optimiser.store, backend.agreement, backend.weakest)
 
     def _tell(self, done: int, total: int) -> None:
         if self._stopped():
@@ -336,7 +363,7 @@ def track_backwards(
     except _Stopped:
         return None
     optimiser.add_reports(frontend.optimiser)
-    return Path.of(store, backend.agreement).turned(known.T_cw[0])
+    return Path.of(store, backend.agreement, backend.weakest).turned(known.T_cw[0])
 
 
 def _updates(passes: Sequence[Pass]) -> int:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from droidw.geometry.projective import NEAR, pixel_grid, relative_pose, reproject
 from droidw.graph.store import KeyframeStore
+from droidw.slam.doubt import Link
 
 __all__ = ["Diagnosis", "diagnose", "parallax", "unusable"]
 
@@ -28,6 +29,8 @@ class Diagnosis:
         points: points of the static cloud, None if unknown.
         agreement: share of what global adjustment measured that agrees with poses and depths, see
             `explained_share`; NaN if unknown.
+        weakest: where least of that agrees, see `weakest_link`.
+        broken: so little that the path has broken there.
         backwards: share of the path between keyframes that was tracked from the last one to the
             first.
     """
@@ -40,6 +43,8 @@ class Diagnosis:
     parallax: float = float("nan")
     points: int | None = None
     agreement: float = float("nan")
+    weakest: Link = Link()
+    broken: bool = False
     backwards: float = 0.0
 
     def warnings(self) -> list[str]:
@@ -57,6 +62,13 @@ class Diagnosis:
             )
         elif self.keyframes > 1:
             told += self._thin()
+        if self.broken:
+            told.append(
+                f"only {self.weakest.share:.0%} of what was matched across frame "
+                f"{self.weakest.frame} agrees with poses and depths: the path has broken there, "
+                "and its parts may differ in scale; look at the pictures around that frame, and "
+                "cut the clip there if they show little but blank walls, blur or what moves"
+            )
         if self.lost > 0.05:
             told.append(
                 f"{self.lost:.0%} of the frames could not be matched with their predecessor "

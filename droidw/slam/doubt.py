@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -16,16 +17,36 @@ if TYPE_CHECKING:
     from droidw.graph.store import KeyframeStore
 
 __all__ = [
+    "Link",
     "doubtful",
+    "explained_across",
     "explained_around",
     "explained_reach",
     "explained_share",
     "explained_weight",
     "scatter",
+    "weakest_link",
 ]
 
 # Distance of measured and predicted place, in cells, at which they agree by half.
 _SCALE = 0.2
+
+
+@dataclass(frozen=True)
+class Link:
+    """What holds a path together between two keyframes.
+
+    Attributes:
+        share: of what was measured across, what agrees with poses and depths; NaN if unknown.
+        frame: index of the first of both; -1 if unknown.
+    """
+
+    share: float = float("nan")
+    frame: int = -1
+
+    def broken(self, below: float) -> bool:
+        """Whether less than this agrees. What is unknown is not."""
+        return self.share < below
 
 
 def doubtful(agreement: float, below: float) -> bool:
@@ -74,12 +95,44 @@ def explained_around(
     Args:
         rows, gates: as of `explained_share`.
     """
-    parts = agreeing_and_known(*_apart(store, graph, rows, gates), _SCALE)
-    edges = torch.stack(parts).sum((2, 3)).cpu()
+    edges = _agreeing_and_known(store, graph, rows, gates)
     totals = edges.new_zeros(2, len(store))
     for ends in graph.index(rows):
         totals.index_add_(1, ends.cpu(), edges)
     return totals[0] / totals[1].clamp_min(1e-6)
+
+
+def explained_across(
+    store: KeyframeStore, graph: FactorGraph, rows: list[int], gates: Tensor
+) -> Tensor:
+    """Share in [0,1] of what was measured across each interval that agrees, [N-1] on the CPU.
+
+    Of the edges that lead from before an interval between keyframes to behind it; 1 where these
+    measured nothing. All edges together do not tell where a path has broken: its pieces are sound,
+    each by itself.
+
+    Args:
+        rows, gates: as of `explained_share`.
+    """
+    edges = _agreeing_and_known(store, graph, rows, gates)
+    ii, jj = (ends.cpu() for ends in graph.index(rows))
+    steps = edges.new_zeros(2, len(store))
+    steps.index_add_(1, torch.minimum(ii, jj), edges)
+    steps.index_add_(1, torch.maximum(ii, jj), -edges)
+    agree, known = steps.cumsum(1)[:, :-1]
+    return torch.where(known > 1e-6, agree / known.clamp_min(1e-6), 1.0).clamp(0.0, 1.0)
+
+
+def weakest_link(store: KeyframeStore, graph: FactorGraph, rows: list[int], gates: Tensor) -> Link:
+    """Where least agrees of what was measured across it; unknown without an interval.
+
+    Args:
+        rows, gates: as of `explained_share`.
+    """
+    if len(store) < 2:
+        return Link()
+    share, at = explained_across(store, graph, rows, gates).min(dim=0)
+    return Link(float(share), store.infos[int(at)].index)
 
 
 def explained_reach(
@@ -110,6 +163,14 @@ def scatter(weight: Tensor) -> float:
     part = weight.flatten() / weight.sum().clamp_min(1e-6)
     off = place - (place * part).sum(1, keepdim=True)
     return float(torch.linalg.det((off * part) @ off.T).clamp_min(0).sqrt())
+
+
+def _agreeing_and_known(
+    store: KeyframeStore, graph: FactorGraph, rows: list[int], gates: Tensor
+) -> Tensor:
+    """Sums over each edge of what agrees and of what was measured, [2,E] float64 on the CPU."""
+    parts = agreeing_and_known(*_apart(store, graph, rows, gates), _SCALE)
+    return torch.stack(parts).sum((2, 3)).cpu().double()
 
 
 def _apart(

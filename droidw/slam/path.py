@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from torch import Tensor
 
 from droidw.geometry.se3 import chained, exp, inv, log, mul
+from droidw.slam.doubt import Link
 
 if TYPE_CHECKING:
     from droidw.graph.store import KeyframeStore
@@ -28,6 +29,7 @@ class Path:
         damping: [N,h,w] as correspondence gave it.
         full: of each keyframe, as `KeyframeInfo.disp_full`.
         agreement: share of what was measured that agrees, see `explained_share`; NaN if unknown.
+        weakest: where least of it agrees, see `weakest_link`.
     """
 
     T_cw: Tensor
@@ -35,9 +37,12 @@ class Path:
     damping: Tensor
     full: tuple[Any, ...]
     agreement: float = float("nan")
+    weakest: Link = Link()
 
     @classmethod
-    def of(cls, store: KeyframeStore, agreement: float = float("nan")) -> Path:
+    def of(
+        cls, store: KeyframeStore, agreement: float = float("nan"), weakest: Link | None = None
+    ) -> Path:
         """Copies of what a store holds now."""
         return cls(
             store.T_cw.clone(),
@@ -45,6 +50,7 @@ class Path:
             store["damping"].clone(),
             tuple(info.disp_full for info in store.infos),
             agreement,
+            weakest or Link(),
         )
 
     def turned(self, first: Tensor) -> Path:

@@ -10,7 +10,7 @@ import torch
 from droidw.geometry.se3 import inv, mul
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import neighbour_edges
-from droidw.slam.doubt import explained_weight
+from droidw.slam.doubt import Link, explained_weight
 from droidw.solve.weights import CLOSED
 
 if TYPE_CHECKING:
@@ -113,6 +113,7 @@ def spliced(path: Path, other: Path, taken: list[bool], gates: Tensor) -> Path:
         damping=torch.stack(damping),
         full=tuple(full),
         agreement=float("nan"),
+        weakest=Link(),
     )
 
 

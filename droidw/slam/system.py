@@ -292,7 +292,7 @@ class SlamSystem:
                 )
                 backend.run(lambda done, total: self.events.emit(Progress("global", done, total)))
                 self._refined(backend.focal)
-                found = replace(found, agreement=backend.agreement)
+                found = replace(found, agreement=backend.agreement, weakest=backend.weakest)
             found = doubted(self.optimiser, self.config, found, self.events, self._stopped)
         with self.clock("fill"):
             trajectory = self._trajectory(reread, quick=brief or found.still)

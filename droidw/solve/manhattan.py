@@ -53,11 +53,11 @@ _ALIKE = 0.05
 _LEAST = 6
 # Angle at which a line agrees with a direction: one in twenty-five does by chance.
 _AGREES = np.radians(1.2)
-# Radians from one picture to the next by which directions are still followed; from where they are
-# expected further than which they are only if so much of the length of all lines agrees. A door that
-# stands open before a bare wall has most of the lines; it is turned by 9 degrees and more, where
-# what was expected was off by 2 at most.
+# Radians from one picture to the next by which directions are still followed.
 _FOLLOWED = np.radians(20.0)
+# Radians from where they are expected, and the share of the length of all lines that has to agree
+# with them further away. An open door before a bare wall has most of the lines; it led away by 9
+# degrees and more, where what was expected was off by 2 at most.
 _EXPECTED, _PLAIN = np.radians(6.0), 0.9
 # Radians from what lines say at which a pose is hardly held to it any more; where the path is
 # settled so many times what is usual, and that much at least.

@@ -18,6 +18,7 @@ from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.slam import backwards as module
 from droidw.slam.backwards import doubted, track_backwards
 from droidw.slam.diagnosis import Diagnosis
+from droidw.slam.doubt import Link
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.path import Path
 from droidw.slam.timing import Stopwatch
@@ -144,6 +145,8 @@ class Settled:
         again: agreement of the way there, measured once more before both are compared.
         adjusted: agreement after each further global adjustment, or what it fails with.
         stopped: whether the run is to end, once the way back is found.
+        links: where the run, the way there measured once more, and the way back hang together
+            least.
         mark: of the depths of the way back. halves: whether further adjustments halve what all
             inverse depths are off 1, in logarithms.
     Attributes:
@@ -158,13 +161,18 @@ class Settled:
         self.asked, self.learned, self.passes, self.compared = 0, [], [], 0
         self.priors, self.begun, self.points = [], [], []
         self.more = {"piece": (), "holds": True, "again": agreement, "adjusted": 0.7} | more
+        self.links = [Link(share, 7) for share in self.more.get("links", (0.5, 0.5, 0.5))]
         mark = self.more.get("mark", 1.0)
-        self.found = bent(optimiser.store, found, mark) if isinstance(found, float) else found
+        self.found = found
+        if isinstance(found, float):
+            self.found = replace(bent(optimiser.store, found, mark), weakest=self.links[2])
         monkeypatch.setattr(module, "track_backwards", self.track)
         monkeypatch.setattr(module, "support", self.support)
         monkeypatch.setattr(module.Backend, "run", lambda backend, tell: self.adjust(backend, tell))
         self.events = Dispatcher()
-        diagnosis = Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=agreement)
+        diagnosis = Diagnosis(
+            COUNT, COUNT, still=False, lost=0.0, agreement=agreement, weakest=self.links[0]
+        )
         stopped = self.more.get("stopped", False)
         self.kept = doubted(
             optimiser, config, diagnosis, self.events, lambda: stopped and self.asked > 0
@@ -190,7 +198,7 @@ class Settled:
         if not self.asked:
             assert not backend.config.schedule["global"].learn
             self.there = made
-            backend.agreement = self.more["again"]
+            backend.agreement, backend.weakest = self.more["again"], self.links[1]
             return
         self.passes.append(made)
         self.learned.append(backend.config.schedule["global"].learn)
@@ -334,6 +342,37 @@ def test_a_run_that_is_to_end_keeps_the_best_so_far(optimiser, config, monkeypat
 def test_only_doubt_asks_for_it(optimiser, config, monkeypatch, below, agreement, asked):
     config.backend.backwards_below = below
     assert Settled(optimiser, config, monkeypatch, None, agreement).asked == asked
+
+
+@pytest.mark.parametrize(
+    ("link", "below", "asked"), [(0.14, 0.15, 1), (0.16, 0.15, 0), (0.0, 0.0, 0)]
+)
+def test_a_broken_path_is_in_doubt_however_much_agrees(
+    optimiser, config, monkeypatch, caplog, link, below, asked
+):
+    config.backend.backwards_below, config.backend.broken_below = 0.7, below
+    with caplog.at_level("INFO", "droidw"):
+        made = Settled(optimiser, config, monkeypatch, None, 0.9, links=(link, 0.5, 0.5))
+    assert made.asked == asked
+    assert ("across frame 7" in caplog.text) == bool(asked)
+    assert (made.kept.weakest, made.kept.broken) == (Link(link, 7), bool(asked))
+    assert any("broken there" in said for said in made.kept.warnings()) == bool(asked)
+
+
+@pytest.mark.parametrize(
+    ("links", "found", "back"),
+    [
+        ((0.1, 0.1, 0.4), 0.4, True),  # less agrees, but it hangs together
+        ((0.1, 0.4, 0.1), 0.6, False),
+        ((0.1, 0.1, 0.05), 0.6, True),  # both have broken
+    ],
+)
+def test_a_way_that_has_not_broken_is_kept(optimiser, config, monkeypatch, links, found, back):
+    config.backend.relearn, config.backend.motion_prior = False, 0.0
+    made = Settled(optimiser, config, monkeypatch, found, links=links)
+    assert made.kept.backwards == float(back)
+    assert made.kept.weakest.share == links[2 if back else 1]
+    assert made.kept.broken == (made.kept.weakest.share < config.backend.broken_below)
 
 
 @pytest.mark.parametrize("fails", [False, True])

@@ -14,7 +14,14 @@ from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
 from droidw.graph.factors import FactorGraph
 from droidw.graph.store import KeyframeInfo, KeyframeStore
-from droidw.slam.doubt import explained_around, explained_reach, explained_share
+from droidw.slam.doubt import (
+    Link,
+    explained_across,
+    explained_around,
+    explained_reach,
+    explained_share,
+    weakest_link,
+)
 from droidw.slam.frontend import Frontend
 
 H, W = 6, 8
@@ -74,6 +81,43 @@ def test_share_around_a_keyframe_is_that_of_its_edges(measured):
     confidence[2] = 0.0
     graph.record(rows, graph.target.clone(), confidence)
     assert explained_around(store, graph, rows, gates).tolist() == pytest.approx([1, 1, 0])
+
+
+def test_a_break_shows_in_what_was_measured_across_it(measured):
+    """Two pieces of three keyframes, each sound by itself."""
+    store, graph, gates = measured
+    for k in range(2, 6):
+        info = KeyframeInfo(2 * k, k / 10, "", np.zeros((48, 64, 3), np.uint8), None)
+        store.append(info, T_cw=torch.tensor([0.1 * k, 0, 0, 0, 0, 0, 1]))
+    gates = torch.ones(6, H, W)
+    pairs = [(k, k + 1) for k in range(1, 5)] + [(1, 3), (4, 2), (0, 4)]
+    graph.add([edge for i, j in pairs for edge in ((i, j), (j, i))])
+    rows = graph.select()
+    place, _ = reproject(store.T_cw, store.disps, store.intrinsics, *graph.index(rows))
+    ii, jj = graph.index(rows)
+    astray = (torch.minimum(ii, jj) <= 2) & (torch.maximum(ii, jj) > 2)
+    target = place + 5.0 * astray[:, None, None, None]
+    graph.record(rows, target, torch.ones(len(rows), H, W, 3))
+    across = explained_across(store, graph, rows, gates)
+    assert across.shape == (5,)
+    assert across[2] < 0.01
+    assert across[0] == pytest.approx(2 / 4, abs=0.1)  # half of its edges lead across the break
+    assert across[4] == pytest.approx(1.0)
+    found = weakest_link(store, graph, rows, gates)
+    assert found == Link(pytest.approx(float(across[2])), frame=4)
+    assert found.broken(0.15) and not found.broken(0.0)
+    assert float(explained_share(store, graph, rows, gates)) > 0.4
+    # where nothing was measured nothing has broken
+    weight = torch.where(astray[:, None, None, None], 0.0, 1.0).expand(-1, H, W, 3)
+    graph.record(rows, target, weight.contiguous())
+    assert explained_across(store, graph, rows, gates).tolist() == pytest.approx([1.0] * 5)
+
+
+def test_a_link_that_is_not_known_is_not_broken(measured):
+    store, _, gates = measured
+    assert not Link().broken(1.0)
+    alone = KeyframeStore(store.grid, store.intrinsics.clone())
+    assert math.isnan(weakest_link(alone, FactorGraph(H, W), [], gates[:0]).share)
 
 
 def test_what_is_broken_or_not_there_does_not_count(measured):
