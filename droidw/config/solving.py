@@ -86,6 +86,13 @@ class WeightingConfig:
         ge=0,
         le=1,
     )
+    open_late: float = opt(
+        0.3,
+        "`open_share` after `backend.learn`, if that is less: what moves may hide most of a "
+        "picture, and is known better by then",
+        ge=0,
+        le=1,
+    )
     bidirectional: bool = opt(False, "also weigh by the gate sampled in the target frame")
     confidence_scale: float = opt(1.0, "factor on the confidence of correspondence", gt=0)
     damping_scale: float = opt(0.2, "factor on the learned depth damping", ge=0)

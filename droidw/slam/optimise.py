@@ -337,7 +337,8 @@ class Optimiser:
 
     def _gate(self, u: Tensor, through: Tensor) -> Tensor:
         w = self.weighting
-        u = opened(u / self._later + evidence(through), w.open_share, w.gate, w.slope, w.shift)
+        share = min(w.open_share, w.open_late) if self.anew else w.open_share
+        u = opened(u / self._later + evidence(through), share, w.gate, w.slope, w.shift)
         return gate(u, w.gate, w.slope, w.shift, w.floor, w.closed_below if self.anew else 0.0)
 
     def _part(self) -> None:

@@ -85,6 +85,21 @@ def test_what_moves_has_no_weight_at_all_once_learned_anew():
     assert optimiser.gates()[1].unique().tolist() == pytest.approx([1 / 55])
 
 
+@pytest.mark.parametrize(("late", "share"), [(0.3, 0.3), (0.5, 0.5), (0.9, 0.5)])
+def test_more_of_a_picture_may_close_once_it_is_known_better(late, share):
+    optimiser, _ = two_keyframes()
+    uncertainty = optimiser.store["uncertainty"]
+    uncertainty[:] = torch.linspace(0.9, 2.0, uncertainty[0].numel()).reshape(uncertainty[0].shape)
+    optimiser.weighting = WeightingConfig(open_late=late)
+
+    def open_():
+        return float((optimiser.gates() == 1.0).float().mean())
+
+    assert open_() == pytest.approx(0.5, abs=0.03)
+    optimiser.anew = True
+    assert open_() == pytest.approx(share, abs=0.03)
+
+
 class Moving:
     """Features that say what can move, and a model that begins with it."""
 
