@@ -50,12 +50,12 @@ def doubted(
 
     What is too little is less where lines hold the path (`Upright.doubts`). Where next to nothing
     agrees across some interval between keyframes the path has broken there, however much agrees
-    elsewhere. Where not quite too
-    little agrees, pieces that points contradict set out anew first: a path in the wrong valley
-    agrees with itself, so it is the one they leave that is to be judged. Then the way there is
-    adjusted once more, by the measurements that doubt asks for. The way back is kept if more of
-    what it measures agrees, then pieces of the way that agrees less in which it agrees more; with
-    what is kept uncertainty goes on learning. What fails is left out.
+    elsewhere. Where not quite too little agrees, pieces that points contradict set out anew first:
+    a path in the wrong valley agrees with itself, so it is the one they leave that is to be judged.
+    Then the way there is adjusted once more, by the measurements that doubt asks for. The way back
+    is kept if more of what it measures agrees, and it has not broken where the way there has not;
+    then pieces of the way that agrees less in which it agrees more. With what is kept uncertainty
+    goes on learning. What fails is left out.
 
     Args:
         optimiser: of the run; poses, depths and uncertainty of its store may change.

@@ -85,10 +85,13 @@ class Upright:
         self.holds: bool | None = None if self._asked else False
 
     def see(self, number: int) -> None:
-        """Find the lines of a keyframe just appended, and turn it as they say."""
+        """Find the lines of a keyframe just added, and turn it as they say.
+
+        Where lines do not count, one that is appended may be reason to ask all of them again.
+        """
         store = self._store
         if self.holds is False:
-            if _due(len(store)):
+            if number + 1 == len(store) and _due(len(store)):
                 self.again()
             return
         with self._clock("lines"):

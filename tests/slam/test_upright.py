@@ -221,6 +221,19 @@ def test_lines_that_come_into_sight_count_while_tracking_goes_on(build, share, c
     assert off.tolist() == pytest.approx([0.0 if counts else 3.085] * len(off), abs=0.1)
 
 
+def test_a_keyframe_from_between_is_no_reason_to_ask_again(build, monkeypatch):
+    upright, store, append, _ = build(lines=askew(16))
+    for number, pose in enumerate(poses(15)):
+        append(number, pose)
+        if number == 4:
+            upright.begin()
+    asked = []
+    monkeypatch.setattr(upright, "again", lambda: asked.append(len(store)))
+    append(15)
+    upright.see(7)
+    assert asked == [16]
+
+
 def half_askew():
     """Lines along the axes in the right half of each picture, and of no direction in the left."""
     random = np.random.default_rng(2)
