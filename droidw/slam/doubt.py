@@ -95,7 +95,7 @@ def explained_around(
     Args:
         rows, gates: as of `explained_share`.
     """
-    edges = _agreeing_and_known(store, graph, rows, gates)
+    edges = _sums_of_edges(store, graph, rows, gates)
     totals = edges.new_zeros(2, len(store))
     for ends in graph.index(rows):
         totals.index_add_(1, ends.cpu(), edges)
@@ -114,7 +114,7 @@ def explained_across(
     Args:
         rows, gates: as of `explained_share`.
     """
-    edges = _agreeing_and_known(store, graph, rows, gates)
+    edges = _sums_of_edges(store, graph, rows, gates)
     ii, jj = (ends.cpu() for ends in graph.index(rows))
     steps = edges.new_zeros(2, len(store))
     steps.index_add_(1, torch.minimum(ii, jj), edges)
@@ -165,7 +165,7 @@ def scatter(weight: Tensor) -> float:
     return float(torch.linalg.det((off * part) @ off.T).clamp_min(0).sqrt())
 
 
-def _agreeing_and_known(
+def _sums_of_edges(
     store: KeyframeStore, graph: FactorGraph, rows: list[int], gates: Tensor
 ) -> Tensor:
     """Sums over each edge of what agrees and of what was measured, [2,E] float64 on the CPU."""

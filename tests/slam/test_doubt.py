@@ -106,7 +106,7 @@ def test_a_break_shows_in_what_was_measured_across_it(measured):
     found = weakest_link(store, graph, rows, gates)
     assert found == Link(pytest.approx(float(across[2])), frame=4)
     assert found.broken(0.15) and not found.broken(0.0)
-    assert float(explained_share(store, graph, rows, gates)) > 0.4
+    assert explained_share(store, graph, rows, gates) > 0.4
     # where nothing was measured nothing has broken
     weight = torch.where(astray[:, None, None, None], 0.0, 1.0).expand(-1, H, W, 3)
     graph.record(rows, target, weight.contiguous())

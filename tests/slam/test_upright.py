@@ -185,11 +185,15 @@ def test_lines_that_lose_their_directions_count_no_longer(build, caplog):
     assert upright.term(store.T_cw, 0, 1.0) is None
 
 
-def hidden(share):
-    """Gates with this share of each picture closed, at its left."""
+def hidden(share, count=lambda: COUNT):
+    """Gates with this share of each picture closed, at its left.
+
+    Args:
+        count: how many keyframes there are.
+    """
 
     def gates(first):
-        found = torch.ones(COUNT - first, GRID.height, GRID.width)
+        found = torch.ones(count() - first, GRID.height, GRID.width)
         found[:, :, : round(share * GRID.width)] = 0.0
         return found
 
@@ -203,11 +207,7 @@ def test_lines_that_come_into_sight_count_while_tracking_goes_on(build, share, c
     true = poses(count)
     lines = askew(5) + [lines_of(pose, random) for pose in true[5:]]
 
-    def gates(first):
-        found = torch.ones(len(store) - first, GRID.height, GRID.width)
-        found[:, : round(share * GRID.height)] = 0.0
-        return found
-
+    gates = hidden(share, lambda: len(store))
     upright, store, append, _ = build(lines=lines, gates=gates)
     drift = turn(0.04, 0.02, -0.03).float()
     for number, pose in enumerate(true):
