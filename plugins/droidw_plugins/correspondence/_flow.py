@@ -27,7 +27,6 @@ from droidw_plugins.correspondence._flow_information import (
 from droidw_plugins.correspondence._flow_lines import line_segments
 from droidw_plugins.correspondence._flow_mask import (
     grown,
-    hidden,
     rounded,
     searched,
     softened,
@@ -105,24 +104,16 @@ class FlowCorrespondence:
         centres = grid.centres().numpy().astype(np.float32)
         scaled = grey * np.float32(255.0)
         picture = rounded(scaled)
-        covered = flat = unseen = None
+        covered = flat = None
         if frame.mask is not None:
             covered = frame.mask.cpu().numpy()
             picture = without(picture, covered)
             scaled = picture.astype(np.float32)
             flat = grown(covered, self.options.reach) if self.options.reach else None
-            unseen = hidden(covered)
         soft, unsoftened = searched(picture, self.options.blur)
         seen = structure(softened(scaled, self.options.blur), centres, self.stride, flat)
         return FlowFrame(
-            frame.index,
-            soft,
-            *seen,
-            centres,
-            self.stride,
-            covered,
-            unsoftened=unsoftened,
-            hidden=unseen,
+            frame.index, soft, *seen, centres, self.stride, covered, unsoftened=unsoftened
         )
 
     def context(self, payload: FlowFrame, frame: Frame, grid: Grid) -> FlowFrame:
@@ -197,8 +188,7 @@ class FlowCorrespondence:
         moved = None if start is None else sample(start, a.centres)
         grey = as_bright(b.grey, self._gain(a, b, moved))
         if warped and start is not None:
-            unseen = (a.hidden, b.hidden) if self.options.paint else None
-            return self._dense.warped(a.grey, grey, start, fine=fine, hidden=unseen)
+            return self._dense.warped(a.grey, grey, start, fine=fine)
         return self._dense(a.grey, grey, start, fine=fine, near=near)
 
     def _gain(self, a: FlowFrame, b: FlowFrame, moved: Array | None) -> float:

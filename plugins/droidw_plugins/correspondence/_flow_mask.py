@@ -15,25 +15,12 @@ import numpy.typing as npt
 from droidw_plugins.correspondence._flow_information import structure
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
-__all__ = [
-    "bridge",
-    "grown",
-    "hidden",
-    "painted",
-    "rounded",
-    "searched",
-    "softened",
-    "surer",
-    "without",
-]
+__all__ = ["bridge", "grown", "rounded", "searched", "softened", "surer", "without"]
 
-Mask = npt.NDArray[np.bool_]
 Picture = npt.NDArray[np.uint8]
 
 # Pixels around a mask that go with it: contours are blurred, by compression and by resizing.
 _MARGIN = 2
-# As many again mix with a bridge where a picture is softened and resampled.
-_MIXED = 2 * _MARGIN
 # Smallest side of the coarsest level, and the share of known pixels that counts as some.
 _COARSEST = 2
 _SOME = 1e-3
@@ -73,24 +60,6 @@ def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
         above = cv2.pyrUp(bridge, dstsize=(level.shape[1], level.shape[0]))
         bridge = level + above * (1.0 - share)
     return np.where(covered, rounded(bridge), grey)
-
-
-def hidden(mask: Mask) -> Mask:
-    """What [H,W] a picture does not show of itself with a bridge over this mask."""
-    return grown(mask, _MIXED)
-
-
-def painted(one: Picture, other: Picture, masks: tuple[Mask, Mask]) -> tuple[Picture, Picture]:
-    """Both pictures, with what one of them alone shows in place of what the other hides.
-
-    A bridge goes with the contour of what it hides, which moves: beside it a search would follow
-    that. Where both show the same they seem to stand still, and nothing is followed.
-
-    Args:
-        one, other: [H,W] of the same view. masks: [H,W] what each of them hides.
-    """
-    seen = np.where(masks[0] & ~masks[1], other, one)
-    return seen, np.where(masks[1], seen, other)
 
 
 def softened(grey: Picture | Array, sigma: float) -> Array:
@@ -135,10 +104,10 @@ def bridge(frame: FlowFrame, gate: Array, below: float, reach: int, blur: float 
     mask: Any = cv2.resize(closed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
     moving = mask > 0
     grey, unsoftened = searched(without(frame.sharp, moving), blur)
-    covered = moving if frame.covered is None else moving | frame.covered
-    made = replace(frame, grey=grey, unsoftened=unsoftened, bridged=closed, hidden=hidden(covered))
+    made = replace(frame, grey=grey, unsoftened=unsoftened, bridged=closed)
     if reach == 0:
         return made
+    covered = moving if frame.covered is None else moving | frame.covered
     seen = softened(frame.sharp, blur)
     left = structure(seen, frame.centres, frame.stride, grown(covered, reach))
     whole = frame.texture, frame.power, frame.normal

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from droidw_plugins.correspondence._flow_information import sample
-from droidw_plugins.correspondence._flow_mask import painted
 
 if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow_raster import Raster
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["DenseSearch"]
 
-Mask = npt.NDArray[np.bool_]
 Picture = npt.NDArray[np.uint8]
 
 # The coarsest level of a search near its start, on which a pixel is four.
@@ -51,15 +49,7 @@ class DenseSearch:
         )
         return flow
 
-    def warped(
-        self,
-        a: Picture,
-        b: Picture,
-        expected: Array,
-        *,
-        fine: bool,
-        hidden: tuple[Mask | None, Mask | None] | None = None,
-    ) -> Array:
+    def warped(self, a: Picture, b: Picture, expected: Array, *, fine: bool) -> Array:
         """The same, with `b` seen through the flow that is expected.
 
         A patch of the search moves as one. Where the camera goes forward, or passes a floor, each
@@ -70,9 +60,6 @@ class DenseSearch:
 
         Args:
             expected: [H,W,2] pixels.
-            hidden: [H,W] what each picture does not show, so that it is painted over with what the
-                other one does, as is what lies beyond the border of `b`; None of a picture: it
-                shows all; None of both: nothing is painted over.
         """
         pixels = self._raster.pixels(*a.shape)
         there = pixels + expected
@@ -80,8 +67,6 @@ class DenseSearch:
         seen: Any = cv2.remap(
             b, there[..., 0], there[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
         )
-        if hidden is not None:
-            a, seen = painted(a, seen, _of_one_view(*hidden, there))
         rest = self(a, seen, None, fine=fine, near=False)
         size = self._options.patch_size << self._scale(fine)
         mean: Any = cv2.GaussianBlur(
@@ -116,20 +101,3 @@ class DenseSearch:
                 engine.setCoarsestScale(max(scale, _NEAR_SCALE))
             setattr(self._local, name, engine)
         return engine
-
-
-def _of_one_view(a: Mask | None, b: Mask | None, there: Array) -> tuple[Mask, Mask]:
-    """What is hidden of the first picture, and of the second one seen at `there` [H,W,2].
-
-    Beyond its border the second one shows nothing.
-    """
-    here, beyond = (np.zeros(there.shape[:2], bool) if m is None else m for m in (a, b))
-    seen: Any = cv2.remap(
-        beyond.view(np.uint8),
-        there[..., 0],
-        there[..., 1],
-        cv2.INTER_NEAREST,
-        borderMode=cv2.BORDER_CONSTANT,
-        borderValue=1,
-    )
-    return here, seen > 0

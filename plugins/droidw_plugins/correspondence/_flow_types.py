@@ -57,8 +57,6 @@ class FlowFrame:
         key: tells frames apart, and pictures of one frame with different masks.
         bridged: [h,w] cells over which `grey` is a smooth bridge, see `_flow_mask`; None: nowhere.
         unsoftened: [H,W] uint8, `grey` as it was; None: it has not been softened.
-        hidden: [H,W] what `grey` does not show: where it is a bridge, and pixels around that mix
-            with it; None: nothing.
         aside: [h,w] cells that may move by themselves: they do not tell how far the picture moved;
             None: none.
     """
@@ -73,7 +71,6 @@ class FlowFrame:
     covered: npt.NDArray[np.bool_] | None = None
     bridged: npt.NDArray[np.bool_] | None = None
     unsoftened: npt.NDArray[np.uint8] | None = None
-    hidden: npt.NDArray[np.bool_] | None = None
     aside: npt.NDArray[np.bool_] | None = None
     key: tuple[int, int] = field(init=False)
 

@@ -56,14 +56,6 @@ class FlowOptions:
             "does not (false: patches set out from that flow)"
         },
     )
-    paint: bool = field(
-        default=True,
-        metadata={
-            "help": "seen through that flow, what one picture alone shows is painted over what the "
-            "other one hides, or ends before: a search does not follow the contour of what moves, "
-            "and falls less short at the border (false: bridges, and the last row goes on)"
-        },
-    )
     fill_window: int = field(
         default=9,
         metadata={
