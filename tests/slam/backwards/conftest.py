@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -73,6 +74,17 @@ def bent(store, agreement, mark=1.0):
     return replace(made, T_cw=mul(bend, store.T_cw), disps=torch.full_like(made.disps, mark))
 
 
+def diagnosed(agreement, **more):
+    """What a run says of itself of which so much agrees."""
+    return Diagnosis(COUNT, COUNT, still=False, lost=0.0, agreement=agreement, **more)
+
+
+@pytest.fixture
+def diagnosis():
+    """`diagnosis(agreement)`, see `diagnosed`."""
+    return diagnosed
+
+
 class Settled:
     """What `doubted` makes of a way back.
 
@@ -107,9 +119,7 @@ class Settled:
         monkeypatch.setattr(module, "support", self.support)
         monkeypatch.setattr(module.Backend, "run", lambda backend, tell: self.adjust(backend, tell))
         self.events = Dispatcher()
-        diagnosis = Diagnosis(
-            COUNT, COUNT, still=False, lost=0.0, agreement=agreement, weakest=self.links[0]
-        )
+        diagnosis = diagnosed(agreement, weakest=self.links[0])
         stopped = self.more.get("stopped", False)
         self.kept = doubted(
             optimiser, config, diagnosis, self.events, lambda: stopped and self.asked > 0
@@ -119,7 +129,7 @@ class Settled:
         self.asked += 1
         if isinstance(self.found, Exception):
             raise self.found
-        return self.found
+        return deepcopy(self.found)  # what is kept is compared with what was found
 
     def support(self, optimiser, path):
         """Asked of the path that is kept, of the other one, and of what was made of both."""

@@ -12,7 +12,6 @@ from droidw.events import Dispatcher
 from droidw.geometry.se3 import exp, mul
 from droidw.slam import backwards as module
 from droidw.slam.backwards import doubted
-from droidw.slam.diagnosis import Diagnosis
 
 
 class Points:
@@ -160,7 +159,9 @@ def test_points_are_asked_where_not_quite_enough_agrees(
     assert (points.set, made.asked) == (asked, 0)
 
 
-def test_points_count_while_pieces_set_out_first(optimiser, config, monkeypatch, contradicting):
+def test_points_count_while_pieces_set_out_first(
+    optimiser, config, monkeypatch, contradicting, diagnosis
+):
     config.backend.backwards_below, config.backend.points = 0.7, 3.0
     counted = []
 
@@ -173,6 +174,5 @@ def test_points_count_while_pieces_set_out_first(optimiser, config, monkeypatch,
     monkeypatch.setattr(
         module, "support", lambda *_: torch.ones(len(optimiser.store) - 1, dtype=torch.float64)
     )
-    diagnosis = Diagnosis(14, 14, still=False, lost=0.0, agreement=0.75)
-    doubted(optimiser, config, diagnosis, Dispatcher(), lambda: False)
+    doubted(optimiser, config, diagnosis(0.75), Dispatcher(), lambda: False)
     assert counted == [("points", 3.0)] * 2

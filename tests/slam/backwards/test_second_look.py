@@ -10,7 +10,6 @@ import torch
 from droidw.events import Dispatcher, Progress
 from droidw.slam import backwards as module
 from droidw.slam.backwards import doubted
-from droidw.slam.diagnosis import Diagnosis
 from droidw.slam.doubt import Link
 
 
@@ -173,7 +172,9 @@ def test_a_way_that_has_not_broken_is_kept(config, links, found, back, settled):
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_correspondence_is_told_of_the_doubt_while_it_lasts(optimiser, config, monkeypatch, fails):
+def test_correspondence_is_told_of_the_doubt_while_it_lasts(
+    optimiser, config, monkeypatch, fails, diagnosis
+):
     asked = []
     session = optimiser.parts.correspondence.session("window")
     monkeypatch.setattr(
@@ -181,19 +182,17 @@ def test_correspondence_is_told_of_the_doubt_while_it_lasts(optimiser, config, m
     )
     if fails:
         monkeypatch.setattr(module._SecondLook, "_finish", lambda self: 1 / 0)
-    diagnosis = Diagnosis(14, 14, still=False, lost=0.0, agreement=0.5)
-    doubted(optimiser, config, diagnosis, Dispatcher(), lambda: False)
+    doubted(optimiser, config, diagnosis(0.5), Dispatcher(), lambda: False)
     assert asked and all(asked)
     assert not optimiser.doubtful
 
 
 @pytest.mark.parametrize("splice", [True, False])
-def test_it_is_told_how_far_it_is(optimiser, config, splice):
+def test_it_is_told_how_far_it_is(optimiser, config, splice, diagnosis):
     heard = Heard()
     config.backend.relearn, config.backend.splice = False, splice
     config.backend.motion_prior = 0.0
-    diagnosis = Diagnosis(14, 14, still=False, lost=0.0, agreement=0.5)
-    doubted(optimiser, config, diagnosis, Dispatcher([("heard", heard)]), lambda: False)
+    doubted(optimiser, config, diagnosis(0.5), Dispatcher([("heard", heard)]), lambda: False)
     told = [(event.done, event.total) for event in heard.events]
     count = len(optimiser.store)
     total = count + 2 * (2 + splice)
