@@ -15,7 +15,7 @@ import numpy.typing as npt
 from droidw_plugins.correspondence._flow_information import structure
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
-__all__ = ["bridge", "grown", "rounded", "searched", "softened", "surer", "without"]
+__all__ = ["bridge", "grown", "outlined", "rounded", "searched", "softened", "surer", "without"]
 
 Picture = npt.NDArray[np.uint8]
 
@@ -26,6 +26,9 @@ _COARSEST = 2
 _SOME = 1e-3
 # Share of cells below which a bridge is not worth a second search.
 _FEW = 0.02
+# Blur of the picture in which contours are looked for, pixels, and the mark of what lies inside.
+_CONTOUR_BLUR = 0.8
+_INSIDE = 2
 
 
 def grown(mask: npt.NDArray[np.bool_], margin: int) -> npt.NDArray[np.bool_]:
@@ -87,22 +90,58 @@ def searched(sharp: Picture, blur: float) -> tuple[Picture, Picture | None]:
     return (rounded(softened(sharp, blur)), sharp) if blur > 0 else (sharp, None)
 
 
-def bridge(frame: FlowFrame, gate: Array, below: float, reach: int, blur: float = 0.0) -> FlowFrame:
+def outlined(grey: Picture, closed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """What closed cells [h,w] cover of a picture [H,W], up to the contours that it has there.
+
+    A cell that is covered in part is closed as a whole, and what is seen of it could be matched.
+    Only what lies a cell inside and a cell outside of the border of closed cells is taken for
+    known; from both, basins are flooded over the slopes of the picture until they meet (watershed:
+    Meyer, Color image segmentation, 1992). Closed cells that have no inside stay as they are.
+    """
+    beside = np.ones((3, 3), np.uint8)
+    cells: Any = closed.astype(np.uint8)
+    inside, outside = cv2.erode(cells, beside) > 0, cv2.dilate(cells, beside) == 0
+    if not outside.any():
+        return _pixels(closed, grey) > 0
+    parts: Any = cv2.connectedComponents(cells, connectivity=8)[1]
+    inside |= closed & ~np.isin(parts, parts[inside])
+    marks = _pixels(np.where(inside, _INSIDE, outside), grey)
+    soft: Any = cv2.GaussianBlur(grey, (0, 0), _CONTOUR_BLUR)
+    basins: Any = cv2.watershed(cv2.merge([soft, soft, soft]), marks.astype(np.int32))
+    return np.asarray(basins == _INSIDE)
+
+
+def _pixels(cells: npt.NDArray[Any], grey: Picture) -> npt.NDArray[np.uint8]:
+    """The values of cells [h,w] at the pixels of a picture [H,W]."""
+    height, width = grey.shape
+    drawn: Any = cv2.resize(
+        cells.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST
+    )
+    return np.asarray(drawn, np.uint8)
+
+
+def bridge(
+    frame: FlowFrame,
+    gate: Array,
+    below: float,
+    reach: int,
+    blur: float = 0.0,
+    outline: bool = True,
+) -> FlowFrame:
     """The frame with a bridge over the cells whose gate [h,w] is less than `below`.
 
-    It is the frame itself where these are too few to matter. Structure beside these cells is that
+    It is the frame itself where these are too few to matter. Structure beside the bridge is that
     of what lies more than `reach` pixels from them (0: of the picture); in them it stays that of
     the picture, by which they keep some confidence.
 
     Args:
         blur: of pictures that are searched, pixels, as in `softened`.
+        outline: it ends at contours, as of `outlined`; else where cells end.
     """
     closed = gate < below
     if closed.mean() < _FEW:
         return frame
-    height, width = frame.grey.shape
-    mask: Any = cv2.resize(closed.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-    moving = mask > 0
+    moving = outlined(frame.sharp, closed) if outline else _pixels(closed, frame.sharp) > 0
     grey, unsoftened = searched(without(frame.sharp, moving), blur)
     made = replace(frame, grey=grey, unsoftened=unsoftened, bridged=closed)
     if reach == 0:

@@ -154,7 +154,9 @@ class FlowSession:
         gates = request.gates(nodes).cpu().numpy()
         frames = [request.payload(node) for node in nodes]
         jobs: list[Callable[[], Any]] = [
-            partial(bridge, f, g, options.bridge, options.reach, options.blur)
+            partial(
+                bridge, f, g, options.bridge, options.reach, options.blur, outline=options.outline
+            )
             for f, g in zip(frames, gates, strict=True)
         ]
         made = zip(nodes, self._owner.map(jobs), strict=True)

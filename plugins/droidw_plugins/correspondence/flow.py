@@ -154,6 +154,13 @@ class FlowOptions:
             "le": 1.0,
         },
     )
+    outline: bool = field(
+        default=True,
+        metadata={
+            "help": "what is taken out so ends at the contours that the picture has about there "
+            "(false: where cells end)"
+        },
+    )
     bridged_share: float = field(
         default=0.2,
         metadata={
