@@ -131,8 +131,8 @@ def bridge(
     """The frame with a bridge over the cells whose gate [h,w] is less than `below`.
 
     It is the frame itself where these are too few to matter. Structure beside the bridge is that
-    of what lies more than `reach` pixels from them (0: of the picture); in them it stays that of
-    the picture, by which they keep some confidence.
+    of what lies more than `reach` pixels from it (0: of the picture); in closed cells it stays that
+    of the picture, by which they keep some confidence.
 
     Args:
         blur: of pictures that are searched, pixels, as in `softened`.
