@@ -98,12 +98,10 @@ def outlined(grey: Picture, closed: npt.NDArray[np.bool_]) -> npt.NDArray[np.boo
     known; from both, basins are flooded over the slopes of the picture until they meet (watershed:
     Meyer, Color image segmentation, 1992). Closed cells that have no inside stay as they are.
     """
-    beside = np.ones((3, 3), np.uint8)
-    cells: Any = closed.astype(np.uint8)
-    inside, outside = cv2.erode(cells, beside) > 0, cv2.dilate(cells, beside) == 0
+    inside, outside = ~grown(~closed, 1), ~grown(closed, 1)
     if not outside.any():
         return _pixels(closed, grey) > 0
-    parts: Any = cv2.connectedComponents(cells, connectivity=8)[1]
+    parts: Any = cv2.connectedComponents(closed.astype(np.uint8), connectivity=8)[1]
     inside |= closed & ~np.isin(parts, parts[inside])
     marks = _pixels(np.where(inside, _INSIDE, outside), grey)
     soft: Any = cv2.GaussianBlur(grey, (0, 0), _CONTOUR_BLUR)
