@@ -105,6 +105,23 @@ def test_masks_are_where_weight_is_lost(result, tmp_path, below, edge):
     assert facts["named"] == "index" and facts["picture"] == [W, H]
 
 
+def test_masks_end_where_the_picture_has_a_contour(result, tmp_path):
+    """What moves begins at column 77, and all of the cell from 72 to 79 lost its weight."""
+    image = np.full((H, W, 3), (90, 120, 60), np.uint8)
+    image[:, 77:] = (140, 120, 60)  # as bright on the whole as it is blue
+    weight = np.ones((H // STRIDE, W // STRIDE), np.float32)
+    weight[:, 9:] = 0
+    keyframes = tuple(replace(k, image=image, weight=weight) for k in result.keyframes)
+    for outline, edge in ((True, 77), (False, 72)):
+        folder = tmp_path / str(outline)
+        folder.mkdir()
+        exporter(maps=False, video=False, mask_outline=outline).export(
+            replace(result, keyframes=keyframes), folder
+        )
+        mask = cv2.imread(str(folder / "masks" / "000002.png"), -1)
+        assert (mask[:, : edge - 1] == 0).all() and (mask[:, edge + 1 :] == 255).all()
+
+
 def test_masks_come_back_as_masks_of_the_user(result, tmp_path):
     exporter(maps=False, video=False).export(result, tmp_path)
     masks = UserMasks(tmp_path / "masks", 5, 5)

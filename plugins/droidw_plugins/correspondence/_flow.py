@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+from droidw.geometry.contour import grown
 from droidw.interfaces.correspondence import Motion, Purpose
 from droidw.solve.weights import CLOSED
 from droidw_plugins.correspondence._flow_exposure import as_bright, brightened
@@ -26,7 +27,6 @@ from droidw_plugins.correspondence._flow_information import (
 )
 from droidw_plugins.correspondence._flow_lines import line_segments
 from droidw_plugins.correspondence._flow_mask import (
-    grown,
     rounded,
     searched,
     softened,

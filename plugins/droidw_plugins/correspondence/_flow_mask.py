@@ -12,10 +12,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from droidw.geometry.contour import grown
+from droidw.geometry.contour import outlined as up_to_contours
 from droidw_plugins.correspondence._flow_information import structure
 from droidw_plugins.correspondence._flow_types import Array, Edge, FlowFrame
 
-__all__ = ["bridge", "grown", "outlined", "rounded", "searched", "softened", "surer", "without"]
+__all__ = ["bridge", "outlined", "rounded", "searched", "softened", "surer", "without"]
 
 Picture = npt.NDArray[np.uint8]
 
@@ -26,17 +28,6 @@ _COARSEST = 2
 _SOME = 1e-3
 # Share of cells below which a bridge is not worth a second search.
 _FEW = 0.02
-# Blur of the picture in which contours are looked for, pixels, and the mark of what lies inside.
-_CONTOUR_BLUR = 0.8
-_INSIDE = 2
-
-
-def grown(mask: npt.NDArray[np.bool_], margin: int) -> npt.NDArray[np.bool_]:
-    """The mask [H,W] and what lies up to `margin` pixels around it, in rows and columns."""
-    size = 2 * margin + 1
-    wide: Any = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))
-    covered: npt.NDArray[np.bool_] = wide > 0
-    return covered
 
 
 def without(grey: Picture, mask: npt.NDArray[np.bool_]) -> Picture:
@@ -91,22 +82,11 @@ def searched(sharp: Picture, blur: float) -> tuple[Picture, Picture | None]:
 
 
 def outlined(grey: Picture, closed: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """What closed cells [h,w] cover of a picture [H,W], up to the contours that it has there.
+    """What closed cells [h,w] cover of a picture [H,W], up to its contours, at most a cell away.
 
     A cell that is covered in part is closed as a whole, and what is seen of it could be matched.
-    Only what lies a cell inside and a cell outside of the border of closed cells is taken for
-    known; from both, basins are flooded over the slopes of the picture until they meet (watershed:
-    Meyer, Color image segmentation, 1992). Closed cells that have no inside stay as they are.
     """
-    inside, outside = ~grown(~closed, 1), ~grown(closed, 1)
-    if not outside.any():
-        return _pixels(closed, grey) > 0
-    parts: Any = cv2.connectedComponents(closed.astype(np.uint8), connectivity=8)[1]
-    inside |= closed & ~np.isin(parts, parts[inside])
-    marks = _pixels(np.where(inside, _INSIDE, outside), grey)
-    soft: Any = cv2.GaussianBlur(grey, (0, 0), _CONTOUR_BLUR)
-    basins: Any = cv2.watershed(cv2.merge([soft, soft, soft]), marks.astype(np.int32))
-    return np.asarray(basins == _INSIDE)
+    return up_to_contours(grey, _pixels(closed, grey) > 0, grey.shape[0] // closed.shape[0])
 
 
 def _pixels(cells: npt.NDArray[Any], grey: Picture) -> npt.NDArray[np.uint8]:

@@ -41,6 +41,12 @@ class UncertaintyOptions:
             "le": 1,
         },
     )
+    mask_outline: bool = field(
+        default=True,
+        metadata={
+            "help": "masks end at contours of the picture up to a cell away; else between cells"
+        },
+    )
     video: bool = field(default=True, metadata={"help": "write uncertainty/overlay.mp4"})
     alpha: float = field(
         default=0.65,
@@ -70,8 +76,9 @@ class UncertaintyExporter:
     run, one 16-bit value per cell; it is not enlarged, since a cell is what was estimated. What
     the values mean is in `scale.json`. `overlay.mp4` shows the keyframes at working size, each
     from its own time on, tinted where uncertainty took away the weight in bundle adjustment.
-    `masks/NNNNNN.png` is the same as black and white at working size, and an input that
-    `--masks` takes. Weights are those of bundle adjustment, the masks of the user included.
+    `masks/NNNNNN.png` is the same as black and white at working size, up to the contours that the
+    picture has there, and an input that `--masks` takes. Weights are those of bundle adjustment,
+    the masks of the user included.
 
     Args:
         options: what to write.
@@ -104,6 +111,7 @@ class UncertaintyExporter:
         return written + ([self._write_video(result, folder)] if options.video else [])
 
     def _write_masks(self, result: RunResult, folder: Path) -> list[Path]:
+        from droidw.geometry.contour import grown, outlined
         from droidw.geometry.spread import closed
         from droidw.io.files import write_json
         from droidw_plugins.exporters._maps import write_map
@@ -113,6 +121,9 @@ class UncertaintyExporter:
         for keyframe in result.keyframes:
             below = self._options.mask_below
             mask = closed(keyframe.weight, result.stride, result.offset, size, below)
+            if self._options.mask_outline:
+                found = outlined(keyframe.image, mask, result.stride)
+                mask = found | (grown(found, 1) & mask)  # the line along contours stays as it was
             path = folder / f"{keyframe.index:06d}.png"
             write_map(path, np.where(mask, 255, 0).astype(np.uint8))
             written.append(path)
