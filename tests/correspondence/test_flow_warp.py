@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from droidw.geometry.camera import Grid
 from droidw.testing.scenes import Scene, SceneSpec
+
+GRID = Grid.of(160, 208, 8, 3.5)
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +91,67 @@ def shifted(waves, moved):
     turned = waves * np.exp(-2j * np.pi * np.fft.fftfreq(waves.shape[1]) * moved)
     picture = np.fft.ifft2(turned).real
     return np.clip(128 + 40 * picture / picture.std(), 0, 255).round().astype(np.uint8)
+
+
+def floor(points):
+    """Displacements of pixels [...,2] as of a floor that comes nearer; it bends by 0.012 in y."""
+    x, y = (points[..., k].astype(np.float64) for k in (0, 1))
+    return np.stack([0.02 * (x - 104) + 0.0004 * (x - 104) * y, 0.006 * (y - 80) ** 2], axis=-1)
+
+
+def test_flow_between_cells_bends_as_a_floor_does(frame, operator):
+    part = operator()
+    a = part.encode(frame(0, np.full((160, 208), 128, np.float32)), GRID)
+    pixels = np.stack(np.meshgrid(np.arange(208), np.arange(160)), axis=-1)
+    target = (a.centres + floor(a.centres) - part.offset) / part.stride
+    inside = np.s_[4:-5, 4:-5]  # between the first cells and the last ones
+    off = [
+        part._raster.dense(target, a, curved=curved).flow[inside] - floor(pixels)[inside]
+        for curved in (True, False)
+    ]
+    assert np.abs(off[0]).max() < 1e-4
+    assert off[1][..., 1].mean() > 0.05
+    bend = part._raster.dense(target, a, curved=True).bend
+    np.testing.assert_allclose(
+        bend[inside], np.broadcast_to([0, 0.012], bend[inside].shape), atol=1e-5
+    )
+    assert part._raster.dense(target, a).bend is None
+
+
+def test_over_an_edge_of_depth_flow_does_not_bend(frame, operator):
+    part = operator()
+    a = part.encode(frame(0, np.full((160, 208), 128, np.float32)), GRID)
+    moved = np.where(a.centres[..., :1] > 100, [9.0, 1.0], [3.0, 0.0])
+    target = (a.centres + moved - part.offset) / part.stride
+    curved, straight = (part._raster.dense(target, a, curved=c) for c in (True, False))
+    assert np.array_equal(curved.flow, straight.flow) and not curved.bend.any()
+
+
+def test_matches_on_a_floor_are_not_all_off_in_one_way(frame, operator, question):
+    pixels = np.stack(np.meshgrid(np.arange(208), np.arange(160)), axis=-1)
+    rng = np.random.default_rng(2)
+    fine = cv2.GaussianBlur(rng.normal(size=(160, 208)).astype(np.float32), (0, 0), 2.5)
+    there = np.clip(128 + 40 * fine / fine.std(), 0, 255)
+    to = (pixels + floor(pixels)).astype(np.float32)
+    here = cv2.remap(
+        there, to[..., 0], to[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REFLECT
+    )
+    mean = {}
+    for curved in (True, False):
+        part = operator(curved=curved, blur=0.0)
+        asked = question(part, [frame(k, grey) for k, grey in enumerate((here, there))])
+        centres = asked.payload(0).centres
+        moved = floor(centres)
+        coords = (centres + moved - part.offset) / part.stride
+        asked = replace(
+            asked, informed=True, coords=torch.from_numpy(coords.astype(np.float32))[None]
+        )
+        found = part.session("global").update(asked)
+        off = found.target[0].numpy() * part.stride + part.offset - centres - moved
+        seen = (centres + moved < [200, 152]).all(-1) & (np.abs(off) < 0.5).all(-1)
+        assert seen.sum() > 150
+        mean[curved] = abs(float(off[seen][:, 1].mean()))
+    assert mean[True] < 0.004 < 0.010 < mean[False]
 
 
 def test_cells_of_a_wrong_depth_tear_nothing(measured):

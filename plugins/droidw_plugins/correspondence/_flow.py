@@ -183,12 +183,13 @@ class FlowCorrespondence:
         fine: bool = False,
         near: bool = False,
         warped: bool = False,
+        bend: Array | None = None,
     ) -> Array:
         """Dense flow a -> b, [H,W,2] pixels; see `DenseSearch`."""
         moved = None if start is None else sample(start, a.centres)
         grey = as_bright(b.grey, self._gain(a, b, moved))
         if warped and start is not None:
-            return self._dense.warped(a.grey, grey, start, fine=fine)
+            return self._dense.warped(a.grey, grey, start, bend, fine=fine)
         return self._dense(a.grey, grey, start, fine=fine, near=near)
 
     def _gain(self, a: FlowFrame, b: FlowFrame, moved: Array | None) -> float:
@@ -317,8 +318,9 @@ class FlowCorrespondence:
         """Dense flow a -> b from these targets; without, as the motion filter searches."""
         if start is not None:
             warped = fine and self.options.warp
-            expected = self._raster.dense(start, a, settled=warped)
-            return self._search(a, b, expected, fine, warped=warped)
+            curved = warped and self.options.curved
+            expected = self._raster.dense(start, a, settled=warped, curved=curved)
+            return self._search(a, b, expected.flow, fine, warped=warped, bend=expected.bend)
         if a.bridged is None and b.bridged is None:
             return self._free(a, b)
         return self._search(a, b, None, fine)

@@ -49,17 +49,19 @@ class DenseSearch:
         )
         return flow
 
-    def warped(self, a: Picture, b: Picture, expected: Array, *, fine: bool) -> Array:
+    def warped(
+        self, a: Picture, b: Picture, expected: Array, bend: Array | None = None, *, fine: bool
+    ) -> Array:
         """The same, with `b` seen through the flow that is expected.
 
         A patch of the search moves as one. Where the camera goes forward, or passes a floor, each
         of its pixels moves by an amount of its own, and the patch is off by what its structure is
         beside its middle. Once that is taken out they all move alike, and little. What is left is
-        the mean over a patch, and goes with the mean of what was expected over it: with what was
-        expected in the middle alone, matches would fall short where flow bends between cells.
+        the mean over a patch, and goes with the mean of what was expected over it. That is not what
+        its middle does where flow bends, by half its variance times the bend.
 
         Args:
-            expected: [H,W,2] pixels.
+            expected: [H,W,2] pixels. bend: [H,W,2] second derivative of it; None: it has none.
         """
         pixels = self._raster.pixels(*a.shape)
         there = pixels + expected
@@ -68,12 +70,10 @@ class DenseSearch:
             b, there[..., 0], there[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
         )
         rest = self(a, seen, None, fine=fine, near=False)
-        size = self._options.patch_size << self._scale(fine)
-        mean: Any = cv2.GaussianBlur(
-            expected, (0, 0), _PATCH * size, borderType=cv2.BORDER_REPLICATE
-        )
+        deviation = _PATCH * (self._options.patch_size << self._scale(fine))
+        mean: Any = cv2.GaussianBlur(expected, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE)
         flow: Array = rest + sample(mean, pixels + rest)
-        return flow
+        return flow if bend is None else flow - np.float32(0.5 * deviation**2) * bend
 
     def _scale(self, fine: bool) -> int:
         return self._options.global_scale if fine else self._options.finest_scale

@@ -56,6 +56,13 @@ class FlowOptions:
             "does not (false: patches set out from that flow)"
         },
     )
+    curved: bool = field(
+        default=True,
+        metadata={
+            "help": "that flow bends between cells as it does along a floor or a wall at a slant "
+            "(false: it is straight from one cell to the next)"
+        },
+    )
     fill_window: int = field(
         default=9,
         metadata={
