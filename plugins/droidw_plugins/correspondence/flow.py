@@ -59,8 +59,8 @@ class FlowOptions:
     curved: bool = field(
         default=True,
         metadata={
-            "help": "that flow bends between cells as it does along a floor or a wall at a slant "
-            "(false: it is straight from one cell to the next)"
+            "help": "flow that poses and depths predict bends between cells, as along a floor or a "
+            "wall at a slant (false: it is straight from one cell to the next)"
         },
     )
     fill_window: int = field(

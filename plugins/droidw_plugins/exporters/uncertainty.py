@@ -129,6 +129,7 @@ class UncertaintyExporter:
             written.append(path)
         facts = {
             "mask": f"255: kept less than {self._options.mask_below:g} of its weight; 0: static",
+            "ends": "at contours" if self._options.mask_outline else "between cells",
             "named": "index",
             "index": "of the frame in the source, counted from 0",
             "picture": list(size),
