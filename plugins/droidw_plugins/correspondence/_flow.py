@@ -318,8 +318,7 @@ class FlowCorrespondence:
         """Dense flow a -> b from these targets; without, as the motion filter searches."""
         if start is not None:
             warped = fine and self.options.warp
-            curved = self.options.curved
-            expected = self._raster.dense(start, a, settled=warped, curved=curved)
+            expected = self._raster.dense(start, a, settled=warped, curved=self.options.curved)
             return self._search(a, b, expected.flow, fine, warped=warped, bend=expected.bend)
         if a.bridged is None and b.bridged is None:
             return self._free(a, b)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from droidw.geometry.projective import pixel_grid
 
@@ -30,7 +31,7 @@ class Raster:
 
     def __init__(self, stride: int, offset: float) -> None:
         self._stride, self._offset = stride, offset
-        self._placed: _Placed | None = None
+        self._placed: tuple[Any, Any, Array, Array] | None = None
         self._pixels: Array | None = None
 
     def dense(
@@ -48,14 +49,14 @@ class Raster:
         if settled:
             flow = _settled(flow)
         height, width = a.grey.shape
-        placed = self._placed_on(height, width, flow.shape[:2])
-        dense = _between(flow, placed.x, placed.y)
+        x, y, across, down = self._placed_on(height, width)
+        dense = np.asarray(
+            cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
+        )
         bend = None
         if curved:
-            across = _between(_bends(flow), placed.left, placed.y)
-            down = _between(_bends(flow.swapaxes(0, 1)).swapaxes(0, 1), placed.x, placed.above)
-            dense -= placed.across * across + placed.down * down
-            bend = (across + down) / np.float32(self._stride**2)
+            dense, bend = _curved(dense, flow, across, down)
+            bend /= np.float32(self._stride**2)
         return Expected(np.clip(dense, -2.0 * width, 2.0 * width), bend)
 
     def pixels(self, height: int, width: int) -> Array:
@@ -64,15 +65,13 @@ class Raster:
             self._pixels = pixel_grid(height, width).numpy()
         return self._pixels
 
-    def _placed_on(self, height: int, width: int, grid: tuple[int, int]) -> _Placed:
-        """Where every pixel lies on the grid [h,w]."""
-        if self._placed is None or self._placed.x.shape != (height, width):
+    def _placed_on(self, height: int, width: int) -> tuple[Any, Any, Array, Array]:
+        """Where pixels lie on the grid, in cells: of each, x, y [H,W]; of columns, rows."""
+        if self._placed is None or self._placed[0].shape != (height, width):
             rows = np.float32(np.clip((np.arange(height) - self._offset) / self._stride, 0, None))
             cols = np.float32(np.clip((np.arange(width) - self._offset) / self._stride, 0, None))
-            x, y = np.meshgrid(cols, rows)
-            left = np.minimum(np.floor(x), np.float32(grid[1] - 2))
-            above = np.minimum(np.floor(y), np.float32(grid[0] - 2))
-            self._placed = _Placed(x, y, left, above, _sag(x - left), _sag(y - above))
+            # In the form that `cv2.remap` likes best.
+            self._placed = (*np.meshgrid(cols, rows), cols, rows)
         return self._placed
 
 
@@ -89,33 +88,38 @@ class Expected(NamedTuple):
     bend: Array | None
 
 
-class _Placed(NamedTuple):
-    """Where pixels [H,W] lie on the grid.
+def _curved(dense: Array, flow: Array, across: Array, down: Array) -> tuple[Array, Array]:
+    """Flow of pixels [H,W,2] that runs straight between cells, bent as that of cells [h,w,2] does.
 
-    Attributes:
-        x, y: in cells. left, above: the cell before.
-        across, down: [H,W,1] by what of a second difference a curve lies below its chord.
+    A parabola lies below its chord by half its second difference times t (1 - t), t from 0 to 1.
+
+    Args:
+        dense: is overwritten. across: columns [W] in cells. down: rows [H].
+    Returns:
+        bent flow, and second differences along x and y in sum, both [H,W,2].
     """
-
-    x: Array
-    y: Array
-    left: Array
-    above: Array
-    across: Array
-    down: Array
-
-
-def _sag(t: Array) -> Array:
-    """By what of its second difference a parabola lies below its chord, at t in [0,1] of it."""
-    inside: Array = np.clip(t, 0, 1)[..., None]
-    return 0.5 * inside * (1 - inside)
+    left, t = _before(across, flow.shape[1])
+    above, s = _before(down, flow.shape[0])
+    t, s = np.repeat(t, 2).reshape(-1, 2), s[:, None, None]
+    x, y = _bends(flow), _bends(flow.swapaxes(0, 1)).swapaxes(0, 1)
+    x = np.take(_lerped(x, above, s, 0), left, axis=1)
+    y = np.take(_lerped(y, left, t, 1), above, axis=0)
+    dense -= 0.5 * t * (1 - t) * x
+    dense -= 0.5 * s * (1 - s) * y
+    x += y
+    return dense, x
 
 
-def _between(values: Array, x: Array, y: Array) -> Array:
-    """Values [h,w,2] of the grid at x, y [H,W] in cells, bilinear."""
-    values = np.ascontiguousarray(values)
-    found: Any = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    between: Array = found
+def _before(at: Array, count: int) -> tuple[npt.NDArray[np.intp], Array]:
+    """The cell before each place [n] in a row of so many, and how far on to the next it lies."""
+    cell = np.minimum(at.astype(np.intp), max(count - 2, 0))
+    return cell, np.clip(at - cell, 0, 1).astype(np.float32)
+
+
+def _lerped(values: Array, cell: npt.NDArray[np.intp], t: Array, axis: int) -> Array:
+    """Values [h,w,2] at places [n] along an axis, `t` on from a cell to the next one."""
+    after = np.minimum(cell + 1, values.shape[axis] - 1)
+    between: Array = np.take(values, cell, axis) * (1 - t) + np.take(values, after, axis) * t
     return between
 
 
