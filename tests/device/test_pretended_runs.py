@@ -18,8 +18,8 @@ CPU = (
 )  # fmt: skip
 # One search: a second one rests on cells that a threshold picks, and rounding picks others. Nor is
 # there an exposure to take out, for up to half of a hundredth is none, nor is a picture resampled,
-# for that is done at whole 32nds of a pixel.
-FLOW = (*CPU, "correspondence.options={bridge: 0, exposure: false, warp: false}")
+# for that is done at whole 32nds of a pixel, nor does flow bend by the depths of so few pictures.
+FLOW = (*CPU, "correspondence.options={bridge: 0, exposure: false, warp: false, curved: false}")
 DROID = (
     "--preset", "droid-slam", "ba=torch",
     "correspondence.options={precision: float32, store: float}",

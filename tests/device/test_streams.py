@@ -27,6 +27,8 @@ FLOW = (
     "correspondence.options.border=0",
     # and whether exposure has changed by half of a hundredth is a matter of rounding
     "correspondence.options.exposure=false",
+    # nor do second differences of such depths hold a path
+    "correspondence.options.curved=false",
 )
 DROID = ("--preset", "droid-slam", "correspondence.options={precision: float32, store: float}",
          "uncertainty=affine-softplus", "features=fit3d", "frontend.predict=velocity")  # fmt: skip

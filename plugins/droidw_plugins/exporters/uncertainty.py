@@ -42,9 +42,10 @@ class UncertaintyOptions:
         },
     )
     mask_outline: bool = field(
-        default=True,
+        default=False,
         metadata={
-            "help": "masks end at contours of the picture up to a cell away; else between cells"
+            "help": "masks end at contours of the picture up to a cell away, which cuts into what "
+            "has contours of its own there (false: between cells)"
         },
     )
     video: bool = field(default=True, metadata={"help": "write uncertainty/overlay.mp4"})
@@ -76,8 +77,8 @@ class UncertaintyExporter:
     run, one 16-bit value per cell; it is not enlarged, since a cell is what was estimated. What
     the values mean is in `scale.json`. `overlay.mp4` shows the keyframes at working size, each
     from its own time on, tinted where uncertainty took away the weight in bundle adjustment.
-    `masks/NNNNNN.png` is the same as black and white at working size, up to the contours that the
-    picture has there, and an input that `--masks` takes. Weights are those of bundle adjustment,
+    `masks/NNNNNN.png` is the same as black and white at working size (up to contours of the picture,
+    if that is asked for), and an input that `--masks` takes. Weights are those of bundle adjustment,
     the masks of the user included.
 
     Args:
