@@ -77,9 +77,9 @@ class UncertaintyExporter:
     run, one 16-bit value per cell; it is not enlarged, since a cell is what was estimated. What
     the values mean is in `scale.json`. `overlay.mp4` shows the keyframes at working size, each
     from its own time on, tinted where uncertainty took away the weight in bundle adjustment.
-    `masks/NNNNNN.png` is the same as black and white at working size (up to contours of the picture,
-    if that is asked for), and an input that `--masks` takes. Weights are those of bundle adjustment,
-    the masks of the user included.
+    `masks/NNNNNN.png` is the same as black and white at working size, up to contours of the picture
+    if that is asked for, and an input that `--masks` takes. Weights are those of bundle
+    adjustment, the masks of the user included.
 
     Args:
         options: what to write.
