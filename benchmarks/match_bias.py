@@ -23,7 +23,6 @@ import numpy.typing as npt
 import torch
 from omegaconf import OmegaConf
 from scenery import SCENES, Renderer
-from worlds import pose_at
 
 from droidw.geometry.camera import Grid
 from droidw.slam.frame import Frame
@@ -52,13 +51,7 @@ class Known:
         self._flow = flow
         self._grid = Grid.of(size[1], size[0], flow.stride, flow.offset)
         self.cells = self._grid.centres().numpy().astype(np.float64)
-        world = self.scene.world
-        still = [
-            (body, pose_at(path, 0.0))
-            for body, path in zip(world.bodies, world.paths, strict=True)
-            if not body.actor
-        ]
-        self._bodies, self._poses = [body for body, _ in still], [pose for _, pose in still]
+        self._bodies, self._poses = self.scene.still()
 
     def payload(self, k: int) -> object:
         """Picture number k as `flow` encodes it."""

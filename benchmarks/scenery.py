@@ -104,19 +104,22 @@ class Renderer:
         """Camera to world."""
         return pose_at(self.camera, k / (self.made.frames - 1))
 
+    def still(self) -> tuple[list[Body], list[Pose]]:
+        """What stands still, and where."""
+        there = [
+            (body, pose_at(path, 0.0))
+            for body, path in zip(self.world.bodies, self.world.paths, strict=True)
+            if not body.actor
+        ]
+        return [body for body, _ in there], [pose for _, pose in there]
+
     def clearance(self) -> float:
         """How near the camera comes to what stands still, in metres along the optical axis."""
         width, height = self.made.size
         x, y = (a.ravel().astype(np.float32) for a in np.mgrid[:width:16, :height:16])
-        world = self.world
-        still = [
-            (body, pose_at(path, 0.0))
-            for body, path in zip(world.bodies, world.paths, strict=True)
-            if not body.actor
-        ]
-        bodies, poses = zip(*still, strict=True)
+        bodies, poses = self.still()
         return min(
-            float(cast(list(bodies), list(poses), self.pose(k), self.intrinsics, x, y).depth.min())
+            float(cast(bodies, poses, self.pose(k), self.intrinsics, x, y).depth.min())
             for k in range(self.made.frames)
         )
 
