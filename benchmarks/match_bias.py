@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -52,14 +53,16 @@ class Known:
         self._grid = Grid.of(size[1], size[0], flow.stride, flow.offset)
         self.cells = self._grid.centres().numpy().astype(np.float64)
         self._bodies, self._poses = self.scene.still()
+        # A picture is in several pairs, and its depth is asked for there and back.
+        self.payload, self.depth = cache(self._payload), cache(self._depth)
 
-    def payload(self, k: int) -> object:
+    def _payload(self, k: int) -> object:
         """Picture number k as `flow` encodes it."""
         image = torch.from_numpy(self.scene.render(k, False)[0]).permute(2, 0, 1).float() / 255
         intrinsics = torch.from_numpy(self.scene.intrinsics).float()
         return self._flow.encode(Frame(k, k / self.scene.made.fps, image, intrinsics), self._grid)
 
-    def depth(self, k: int) -> Array:
+    def _depth(self, k: int) -> Array:
         """Depth [h,w] of the cells of picture number k."""
         x, y = (self.cells[..., axis].ravel().astype(np.float32) for axis in (0, 1))
         hits = cast(self._bodies, self._poses, self.scene.pose(k), self.scene.intrinsics, x, y)
