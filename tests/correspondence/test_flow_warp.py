@@ -29,12 +29,12 @@ def pictures(frame, room):
 
 @pytest.fixture(scope="module")
 def measured(operator, question, pictures, room):
-    """`measured(off, wrong, purpose, **options)`: targets, px, true ones, where they are known.
+    """`measured(off, wrong, purpose, updates, **options)`: targets, true ones, px, which known.
 
     Predicted is the truth, `off` pixels to the right, and a share `wrong` of it anywhere near.
     """
 
-    def call(off=0.0, wrong=0.0, purpose="global", **options):
+    def call(off=0.0, wrong=0.0, purpose="global", updates=1, **options):
         part = operator(**options)
         asked = replace(question(part, pictures), informed=True)
         truth = room.correspond(0, 20, asked.payload(0).centres.astype(np.float64))
@@ -44,7 +44,9 @@ def measured(operator, question, pictures, room):
         there[strays] += rng.uniform(-20.0, 20.0, (strays.sum(), 2))
         coords = (there - part.offset) / part.stride
         asked = replace(asked, coords=torch.from_numpy(coords.astype(np.float32))[None])
-        found = part.session(purpose).update(asked)
+        session = part.session(purpose)
+        for _ in range(updates):
+            found = session.update(asked)
         target = found.target[0].numpy() * part.stride + part.offset
         known = truth.visible & (found.confidence[0, ..., :2].numpy().min(-1) > 0.3)
         assert known.mean() > 0.3
@@ -171,3 +173,27 @@ def test_a_wrong_prediction_is_not_confirmed(measured):
 def test_the_window_sets_out_as_it_did(measured):
     both = [measured(purpose="window", warp=warp)[0] for warp in (True, False)]
     assert np.array_equal(*both)
+
+
+def test_frames_between_keyframes_are_seen_again_so(measured):
+    once, again = (measured(purpose="fill", updates=updates) for updates in (1, 2))
+    assert error(again) < 0.4 * error(once)
+    assert error(measured(off=0.4, purpose="fill", updates=2)) < 0.4 * error(once)
+
+
+@pytest.mark.parametrize("options", [{"warp": False}, {"fill_window": 0}])
+def test_or_are_left_as_they_were_found(measured, options):
+    once, again = (measured(purpose="fill", updates=n, **options)[0] for n in (1, 2))
+    assert np.array_equal(once, again)
+
+
+def test_a_wrong_prediction_leads_no_frame_elsewhere(measured):
+    once, again = (measured(off=12.0, wrong=0.2, purpose="fill", updates=n)[0] for n in (1, 2))
+    assert np.linalg.norm(again - once, axis=-1).max() < 1.5 * 2**0.5 + 1e-3
+
+
+def test_nor_does_one_that_nobody_believes(operator, question, pictures):
+    part = operator()
+    asked, session = question(part, pictures), part.session("fill")
+    once, again = (session.update(asked).target for _ in range(2))
+    assert torch.equal(once, again)

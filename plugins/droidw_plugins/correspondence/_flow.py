@@ -34,9 +34,9 @@ from droidw_plugins.correspondence._flow_mask import (
     without,
 )
 from droidw_plugins.correspondence._flow_motion import picture_motion
-from droidw_plugins.correspondence._flow_polish import polished
+from droidw_plugins.correspondence._flow_polish import SMALLEST, polished, polished_through
 from droidw_plugins.correspondence._flow_raster import Raster
-from droidw_plugins.correspondence._flow_search import DenseSearch
+from droidw_plugins.correspondence._flow_search import DenseSearch, seen_through
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import (
@@ -219,6 +219,27 @@ class FlowCorrespondence:
         gain = self._gain(a, b, found)
         grey = as_bright(b.grey, gain)
         moved = polished(a.grey, grey, a.centres, found, self.options.fill_window)
+        return self._agreed(a, b, moved, gain)
+
+    def one_way_again(self, a: FlowFrame, b: FlowFrame, edge: Edge, start: Array | None) -> Edge:
+        """Edge a -> b once more, by windows of `b` as it looks through what is predicted.
+
+        Args:
+            edge: what was found. start: targets [h,w,2] that are predicted, cells; None: unknown.
+        """
+        if start is None or not self.options.warp or self.options.fill_window < SMALLEST:
+            return edge
+        before = self.stride * edge.target + self.offset - a.centres
+        gain = self._gain(a, b, before)
+        expected = self._raster.dense(start, a, settled=True, curved=self.options.curved).flow
+        there = self._raster.pixels(*a.grey.shape) + expected
+        seen = seen_through(as_bright(b.grey, gain), there)
+        window = self.options.fill_window
+        moved = polished_through(a.grey, seen, a.centres, before, expected, window)
+        return self._agreed(a, b, moved, gain)
+
+    def _agreed(self, a: FlowFrame, b: FlowFrame, moved: Array, gain: float) -> Edge:
+        """Edge a -> b by displacements [h,w,2] px at the cells, judged by brightness."""
         agrees = agreement(a, b, moved, gain)
         agrees *= framed(a, moved, self.options.border)
         confidence = information(a, agrees, agrees, self.options)

@@ -12,10 +12,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from droidw_plugins.correspondence._flow_information import sample
+
 if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow_types import Array
 
-__all__ = ["polished"]
+__all__ = ["SMALLEST", "polished", "polished_through"]
 
 Picture = npt.NDArray[np.uint8]
 
@@ -27,7 +29,7 @@ _STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 15, 0.005)
 # Smaller eigenvalue, grey levels^2 per pixel^2 in OpenCV's scale, below which a window is flat.
 _FLAT = 1e-4
 # Smallest window that OpenCV takes.
-_SMALLEST = 3
+SMALLEST = 3
 # Grey level that stands for no difference from the surroundings.
 _MIDDLE = 128
 
@@ -45,8 +47,36 @@ def polished(a: Picture, b: Picture, points: Array, moved: Array, window: int) -
     Returns:
         [h,w,2] displacements; as found where a window is flat, leaves the picture or strays.
     """
-    if window < _SMALLEST:
+    if window < SMALLEST:
         return moved
+    better, known = _followed(a, b, points, moved, window)
+    return np.where(known[..., None], better, moved)
+
+
+def polished_through(
+    a: Picture, seen: Picture, points: Array, moved: Array, expected: Array, window: int
+) -> Array:
+    """The same where it is known what moves how, with `b` as it looks through that.
+
+    A window moves as one, and what comes nearer grows. Seen through what is expected it does not,
+    and what is left of the motion is little.
+
+    Args:
+        a: [H,W]. seen: [H,W], `b` seen through `expected`, [H,W,2] pixels.
+        points, moved: as of `polished`. window: at least `SMALLEST`.
+    Returns:
+        [h,w,2] displacements from `a` to `b`; as found before where that leads elsewhere.
+    """
+    rest, known = _followed(a, seen, points, np.zeros_like(moved), window)
+    through = rest + sample(expected, points + rest)
+    known &= np.abs(through - moved).max(axis=-1) < _FARTHEST
+    return np.where(known[..., None], through, moved)
+
+
+def _followed(
+    a: Picture, b: Picture, points: Array, moved: Array, window: int
+) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Where windows that set out from `moved` come to rest, [h,w,2], and which did, [h,w]."""
     start = np.ascontiguousarray(points.reshape(-1, 1, 2), dtype=np.float32)
     found = start + moved.reshape(-1, 1, 2)
     there, known, _ = cv2.calcOpticalFlowPyrLK(
@@ -61,8 +91,8 @@ def polished(a: Picture, b: Picture, points: Array, moved: Array, window: int) -
         minEigThreshold=_FLAT,
     )
     near = np.abs(there - found).max(axis=-1) < _FARTHEST
-    better: Array = np.where(((known > 0) & near)[..., None], there, found) - start
-    return better.reshape(moved.shape)
+    rests: Array = (there - start).reshape(moved.shape)
+    return rests, ((known > 0) & near).reshape(moved.shape[:-1])
 
 
 def _contrast(grey: Picture, window: int) -> Picture:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from droidw_plugins.correspondence._flow_types import Array
     from droidw_plugins.correspondence.flow import FlowOptions
 
-__all__ = ["DenseSearch"]
+__all__ = ["DenseSearch", "seen_through"]
 
 Picture = npt.NDArray[np.uint8]
 
@@ -64,12 +64,7 @@ class DenseSearch:
             expected: [H,W,2] pixels. bend: [H,W,2] second derivative of it; None: it has none.
         """
         pixels = self._raster.pixels(*a.shape)
-        there = pixels + expected
-        # OpenCV's cubic interpolation displaces a picture by up to a twentieth of a pixel.
-        seen: Any = cv2.remap(
-            b, there[..., 0], there[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
-        )
-        rest = self(a, seen, None, fine=fine, near=False)
+        rest = self(a, seen_through(b, pixels + expected), None, fine=fine, near=False)
         deviation = _PATCH * (self._options.patch_size << self._scale(fine))
         mean: Any = cv2.GaussianBlur(expected, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE)
         flow: Array = rest + sample(mean, pixels + rest)
@@ -101,3 +96,12 @@ class DenseSearch:
                 engine.setCoarsestScale(max(scale, _NEAR_SCALE))
             setattr(self._local, name, engine)
         return engine
+
+
+def seen_through(picture: Picture, there: Array) -> Picture:
+    """What a picture [H,W] shows at the places [H,W,2], pixels, where its own would move to."""
+    # OpenCV's cubic interpolation displaces a picture by up to a twentieth of a pixel.
+    seen: Any = cv2.remap(
+        picture, there[..., 0], there[..., 1], cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(seen, np.uint8)

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 __all__ = ["FlowSession"]
 
+# Share of the cells of an edge whose place in the other picture has to be predicted for a search to
+# set out from that.
+_KNOWN = 0.5
+
 
 class FlowSession:
     """Edges measured once, and again when geometry says that the search went elsewhere."""
@@ -43,7 +47,7 @@ class FlowSession:
         bridged = self._bridged(request, sorted(wanted.union(blind)))
         wanted.update(row for row in blind if any(n in bridged for n in _ends(request, row)))
         if self._one_way:
-            self._measure_one_way(request, sorted(wanted))
+            self._measure_one_way(request, wanted, coords)
         else:
             self._measure_pairs(request, sorted(wanted), coords, bridged)
         if not request.ids:
@@ -89,12 +93,19 @@ class FlowSession:
                 astray.append(row)
         return astray
 
-    def _measure_one_way(self, request: EdgeRequest, wanted: list[int]) -> None:
+    def _measure_one_way(self, request: EdgeRequest, new: set[int], coords: Array) -> None:
+        """Search what is new, and see all else again through what is predicted by now."""
+        starts = _predicted(request, coords)
+
         def job(row: int) -> Callable[[], Edge]:
             a, b = request.payload(request.ii[row]), request.payload(request.jj[row])
-            return lambda: self._owner.one_way(a, b)
+            if row in new:
+                return lambda: self._owner.one_way(a, b)
+            edge = self._edges[request.ids[row]]
+            return lambda: self._owner.one_way_again(a, b, edge, starts[row])
 
-        for row, edge in zip(wanted, self._owner.map([job(r) for r in wanted]), strict=True):
+        rows = range(len(request.ids))
+        for row, edge in zip(rows, self._owner.map([job(r) for r in rows]), strict=True):
             self._edges[request.ids[row]] = edge
 
     def _measure_pairs(
@@ -117,12 +128,10 @@ class FlowSession:
         ends = zip(request.ii, request.jj, strict=True)
         predicted = {end: row for row, end in enumerate(ends)}
         options = self._owner.options
-        valid = request.valid.cpu().numpy() if request.informed and wanted else None
+        known = _predicted(request, coords) if wanted else []
 
         def start(row: int | None) -> Array | None:
-            if row is None or valid is None:
-                return None
-            return coords[row] if valid[row].mean() > 0.5 else None
+            return None if row is None else known[row]
 
         def job(key: tuple[int, int]) -> Callable[[], Any]:
             a, b = request.payload(key[0]), request.payload(key[1])
@@ -166,3 +175,11 @@ class FlowSession:
 def _ends(request: EdgeRequest, row: int) -> tuple[int, int]:
     """The nodes of an edge."""
     return request.ii[row], request.jj[row]
+
+
+def _predicted(request: EdgeRequest, coords: Array) -> list[Array | None]:
+    """Where poses and depths put the cells of edges, [h,w,2] cells each; None if hardly known."""
+    if not request.informed:
+        return [None] * len(coords)
+    valid = request.valid.cpu().numpy()
+    return [one if v.mean() > _KNOWN else None for one, v in zip(coords, valid, strict=True)]

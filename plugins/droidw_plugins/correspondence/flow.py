@@ -52,8 +52,9 @@ class FlowOptions:
         default=True,
         metadata={
             "help": "global bundle adjustment searches the second picture as it looks through the "
-            "flow that poses and depths predict: patches move as one, and what is seen at a slant "
-            "does not (false: patches set out from that flow)"
+            "flow that poses and depths predict, and so are frames between keyframes seen again: "
+            "patches move as one, and what is seen at a slant does not (false: patches set out "
+            "from that flow, and these frames are seen once)"
         },
     )
     curved: bool = field(
@@ -67,7 +68,7 @@ class FlowOptions:
         default=9,
         metadata={
             "help": "width of the windows in which frames between keyframes are matched again, at "
-            "full size (below 3: as the search left them)",
+            "full size, as found and then as predicted (below 3: as the search left them)",
             "ge": 0,
             "le": 31,
         },
