@@ -14,17 +14,10 @@ import numpy as np
 from droidw.geometry.contour import grown
 from droidw.interfaces.correspondence import Motion, Purpose
 from droidw.solve.weights import CLOSED
-from droidw_plugins.correspondence._flow_exposure import as_bright, brightened
-from droidw_plugins.correspondence._flow_information import (
-    agreement,
-    framed,
-    information,
-    likeness,
-    sample,
-    structure,
-    trust,
-    turned,
-)
+from droidw_plugins.correspondence._flow_again import Windows, but_for_closed
+from droidw_plugins.correspondence._flow_check import Checks
+from droidw_plugins.correspondence._flow_exposure import as_bright
+from droidw_plugins.correspondence._flow_information import agreement, sample, structure
 from droidw_plugins.correspondence._flow_lines import line_segments
 from droidw_plugins.correspondence._flow_mask import (
     rounded,
@@ -34,9 +27,9 @@ from droidw_plugins.correspondence._flow_mask import (
     without,
 )
 from droidw_plugins.correspondence._flow_motion import picture_motion
-from droidw_plugins.correspondence._flow_polish import SMALLEST, polished, polished_through
+from droidw_plugins.correspondence._flow_polish import polished
 from droidw_plugins.correspondence._flow_raster import Raster
-from droidw_plugins.correspondence._flow_search import DenseSearch, seen_through
+from droidw_plugins.correspondence._flow_search import DenseSearch
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import (
@@ -90,6 +83,8 @@ class FlowCorrespondence:
         workers = options.workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
         self._dense = DenseSearch(options, self._raster)
+        self._windows = Windows(options, self._raster)
+        self._checks = Checks(options, self._raster)
         self._latest: tuple[_Pair, Array] | None = None
         self._full: Kept[_Pair, Array] = Kept(_FULL_FIELDS)
         self._grid: Kept[_Pair, Array] = Kept(_GRID_FIELDS)
@@ -137,7 +132,7 @@ class FlowCorrespondence:
         flow = self._search(reference, current, start)
         self._latest = (reference.key, current.key), flow
         moved = self._moved(reference, current, lambda a, b: flow)
-        agrees = agreement(reference, current, moved, self._gain(reference, current, moved))
+        agrees = agreement(reference, current, moved, self._checks.gain(reference, current, moved))
         motion = picture_motion(moved, agrees, reference, self.options)
         known = motion.matched > _TRACKED
         self._track = Track.after(self._track, reference, current, flow) if known else None
@@ -187,14 +182,10 @@ class FlowCorrespondence:
     ) -> Array:
         """Dense flow a -> b, [H,W,2] pixels; see `DenseSearch`."""
         moved = None if start is None else sample(start, a.centres)
-        grey = as_bright(b.grey, self._gain(a, b, moved))
+        grey = as_bright(b.grey, self._checks.gain(a, b, moved))
         if warped and start is not None:
             return self._dense.warped(a.grey, grey, start, bend, fine=fine)
         return self._dense(a.grey, grey, start, fine=fine, near=near)
-
-    def _gain(self, a: FlowFrame, b: FlowFrame, moved: Array | None) -> float:
-        """What exposure made of brightness from `a` to `b`, if that is asked for."""
-        return brightened(a, b, moved) if self.options.exposure else 1.0
 
     def _free(self, a: FlowFrame, b: FlowFrame) -> Array:
         """Flow a -> b without geometry: the motion filter's, where it made b a keyframe."""
@@ -216,10 +207,10 @@ class FlowCorrespondence:
     def one_way(self, a: FlowFrame, b: FlowFrame) -> Edge:
         """Edge a -> b without the way back, exact at full size."""
         found = self._moved(a, b, self._search)
-        gain = self._gain(a, b, found)
+        gain = self._checks.gain(a, b, found)
         grey = as_bright(b.grey, gain)
         moved = polished(a.grey, grey, a.centres, found, self.options.fill_window)
-        return self._agreed(a, b, moved, gain)
+        return self._checks.one_way(a, b, moved, gain)
 
     def one_way_again(self, a: FlowFrame, b: FlowFrame, edge: Edge, start: Array | None) -> Edge:
         """Edge a -> b once more, by windows of `b` as it looks through what is predicted.
@@ -227,24 +218,12 @@ class FlowCorrespondence:
         Args:
             edge: what was found. start: targets [h,w,2] that are predicted, cells; None: unknown.
         """
-        if start is None or not self.options.warp or self.options.fill_window < SMALLEST:
+        if start is None or not self._windows.fill:
             return edge
-        before = self.stride * edge.target + self.offset - a.centres
-        gain = self._gain(a, b, before)
-        expected = self._raster.dense(start, a, settled=True, curved=self.options.curved).flow
-        there = self._raster.pixels(*a.grey.shape) + expected
-        seen = seen_through(as_bright(b.grey, gain), there)
-        window = self.options.fill_window
-        moved = polished_through(a.grey, seen, a.centres, before, expected, window)
-        return self._agreed(a, b, moved, gain)
-
-    def _agreed(self, a: FlowFrame, b: FlowFrame, moved: Array, gain: float) -> Edge:
-        """Edge a -> b by displacements [h,w,2] px at the cells, judged by brightness."""
-        agrees = agreement(a, b, moved, gain)
-        agrees *= framed(a, moved, self.options.border)
-        confidence = information(a, agrees, agrees, self.options)
-        target = ((a.centres + moved - self.offset) / self.stride).astype(np.float32)
-        return Edge(target, confidence, None)
+        before = self._raster.moved(edge.target, a)
+        gain = self._checks.gain(a, b, before)
+        moved = self._windows.cells(a, b, gain, start, before)
+        return self._checks.one_way(a, b, moved, gain)
 
     def both_ways(
         self,
@@ -259,7 +238,8 @@ class FlowCorrespondence:
     ) -> tuple[Edge, Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
-        What was found without about the same cells, from about the same start, is kept.
+        What was found without about the same cells, from about the same start, is kept; if not
+        quite the same, windows go on from it (`again_window`), and else all is searched.
 
         Args:
             a, b: frames. start_ab, start_ba: targets [h,w,2] to start from; None: free.
@@ -267,25 +247,63 @@ class FlowCorrespondence:
             bridged: both without what moves, or as they are; what is found there counts if surer.
             seeded: whether another search sets out from points matched by their descriptors.
         """
-        c, d = bridged
-        key = (a.key, b.key, fine, seeded)
-        starts = start_ab, start_ba
+        key, starts = (a.key, b.key, fine), (start_ab, start_ba)
         known, change = self._pairs.get(key), self.options.bridge_change
+        if known and seeded and not known[0].seeded:
+            known = None
         if known and set_out_from(known, starts) and taken_out_alike(known, bridged, change):
             return replace(known[0]), replace(known[1])
-        whole = None if c.bridged is d.bridged is None else self._whole((a, b), starts, fine)
-        flows = self._started(c, d, start_ab, fine), self._started(d, c, start_ba, fine)
-        both = self._checked_both((c, d), self._found_both((c, d), flows, starts))
-        if whole is not None:
-            there, back = self._checked_both((c, d), whole)
-            share = self.options.bridged_share
-            both = surer(there, both[0], c.bridged, share), surer(back, both[1], d.bridged, share)
-        if seeded:
-            seeds = self._seeds.between(a, b, c.bridged, d.bridged)
-            both = self._seeded(seeds, (c, d), flows, both, fine)
-        both = replace(both[0], bridged=c.bridged), replace(both[1], bridged=d.bridged)
+        if known and fine and self._windows.suffice(known, starts):
+            both = self._again(bridged, known, starts)
+        else:
+            both = self._searched((a, b), bridged, starts, fine, seeded)
         self._pairs.put(key, both)
         return replace(both[0]), replace(both[1])
+
+    def _again(
+        self,
+        frames: tuple[FlowFrame, FlowFrame],
+        known: tuple[Edge, Edge],
+        starts: tuple[Array | None, Array | None],
+    ) -> tuple[Edge, Edge]:
+        """Edges there and back between frames without what moves, from what was found before."""
+        (a, b), (ab, ba) = frames, known
+        flows = self._moved_on(a, b, starts[0], ab), self._moved_on(b, a, starts[1], ba)
+        there, back = self._checks.edges(frames, self._checks.found(frames, flows, starts))
+        share = self.options.bridged_share
+        return but_for_closed(there, ab, a.bridged, share), but_for_closed(
+            back, ba, b.bridged, share
+        )
+
+    def _searched(
+        self,
+        frames: tuple[FlowFrame, FlowFrame],
+        bridged: tuple[FlowFrame, FlowFrame],
+        starts: tuple[Array | None, Array | None],
+        fine: bool,
+        seeded: bool,
+    ) -> tuple[Edge, Edge]:
+        """Edges there and back, as of `both_ways`, by a search of the pictures."""
+        a, b = bridged
+        whole = None if a.bridged is b.bridged is None else self._whole(frames, starts, fine)
+        flows = self._started(a, b, starts[0], fine), self._started(b, a, starts[1], fine)
+        both = self._checks.edges(bridged, self._checks.found(bridged, flows, starts))
+        if whole is not None:
+            there, back = self._checks.edges(bridged, whole)
+            share = self.options.bridged_share
+            both = surer(there, both[0], a.bridged, share), surer(back, both[1], b.bridged, share)
+        if seeded:
+            seeds = self._seeds.between(*frames, a.bridged, b.bridged)
+            both = self._seeded(seeds, bridged, flows, both, fine)
+        found = zip(both, bridged, strict=True)
+        there, back = (replace(e, bridged=f.bridged, seeded=seeded) for e, f in found)
+        return there, back
+
+    def _moved_on(self, a: FlowFrame, b: FlowFrame, start: Array | None, edge: Edge) -> Array:
+        """Dense flow a -> b from the matches of an edge; of pairs for which windows suffice."""
+        assert start is not None
+        gain = self._checks.gain(a, b, self._raster.moved(edge.target, a))
+        return self._windows.dense(a, b, gain, start, edge)
 
     def _whole(
         self,
@@ -303,7 +321,7 @@ class FlowCorrespondence:
         if known is not None and set_out_from(known, starts):
             return known
         flows = self._started(a, b, starts[0], fine), self._started(b, a, starts[1], fine)
-        found = self._found_both(frames, flows, starts)
+        found = self._checks.found(frames, flows, starts)
         if not self.options.turn_reach:  # with the flow itself it would be too large
             self._plain.put(key, found)
         return found
@@ -329,7 +347,7 @@ class FlowCorrespondence:
             return edges
         ab, ba = self._search(a, b, ab, fine, near=True), self._search(b, a, ba, fine, near=True)
         starts = edges[0].started, edges[1].started
-        there, back = self._checked_both(frames, self._found_both(frames, (ab, ba), starts))
+        there, back = self._checks.edges(frames, self._checks.found(frames, (ab, ba), starts))
         return (
             surer(edges[0], there, a.bridged, clearly=_CLEARLY),
             surer(edges[1], back, b.bridged, clearly=_CLEARLY),
@@ -344,45 +362,6 @@ class FlowCorrespondence:
         if a.bridged is None and b.bridged is None:
             return self._free(a, b)
         return self._search(a, b, None, fine)
-
-    def _found_both(
-        self,
-        frames: tuple[FlowFrame, FlowFrame],
-        flows: tuple[Array, Array],
-        starts: tuple[Array | None, Array | None],
-    ) -> tuple[Found, Found]:
-        """What flow there and back between these frames comes to at the cells of both."""
-        (a, b), (ab, ba) = frames, flows
-        return self._found(a, b, ab, ba, starts[0]), self._found(b, a, ba, ab, starts[1])
-
-    def _found(
-        self, a: FlowFrame, b: FlowFrame, ab: Array, ba: Array, started: Array | None
-    ) -> Found:
-        moved = sample(ab, a.centres)
-        apart = moved + sample(ba, a.centres + moved, outside=1e4)
-        share = framed(a, moved, self.options.border)
-        if self.options.likeness > 0:
-            pixels = self._raster.pixels(*a.grey.shape)
-            gain = self._gain(a, b, moved)
-            share = share * likeness(a, b, ab, pixels, self.options.likeness, gain)
-        return Found(moved, apart, share, ab if self.options.turn_reach else None, started)
-
-    def _checked_both(
-        self, frames: tuple[FlowFrame, FlowFrame], found: tuple[Found, Found]
-    ) -> tuple[Edge, Edge]:
-        """Both edges between these frames, from what was found there and back."""
-        return self._checked(frames[0], found[0]), self._checked(frames[1], found[1])
-
-    def _checked(self, a: FlowFrame, found: Found) -> Edge:
-        """Edge from `a`, by the structure of that frame."""
-        across, along = trust(found.apart, a.normal, self.options)
-        across, along = across * found.share, along * found.share
-        normal = None
-        if found.flow is not None:
-            normal = turned(a, found.flow, self.options.turn_reach)
-        confidence = information(a, across, along, self.options, normal)
-        target = ((a.centres + found.moved - self.offset) / self.stride).astype(np.float32)
-        return Edge(target, confidence, found.started)
 
     def settle(self) -> None:
         """End a round of searches: pairs of long ago are given up."""

@@ -164,7 +164,7 @@ def matched(a: Points, b: Points) -> Seeds:
     best, rows = best[mutual], np.flatnonzero(mutual)
     left = apart[rows]
     distance = left[np.arange(len(rows)), best]
-    left[_length(b.at[best][:, None] - b.at) < _ANOTHER] = np.inf
+    left[_apart(b.at[best], b.at) < _ANOTHER] = np.inf
     # Squares of distances, by half.
     sure = distance < _RATIO**2 * left.min(axis=1)
     rows, best = rows[sure], best[sure]
@@ -174,9 +174,9 @@ def matched(a: Points, b: Points) -> Seeds:
 def coherent(seeds: Seeds) -> Seeds:
     """Those that move as others around them do."""
     moved = seeds.there - seeds.here
-    distance = _length(seeds.here[:, None] - seeds.here)
+    distance = _apart(seeds.here, seeds.here)
     around = (distance < _AROUND) & (distance > _BACK)
-    alike = _length(moved[:, None] - moved) < _ALIKE + _ALIKE_FAR * distance
+    alike = _apart(moved, moved) < _ALIKE + _ALIKE_FAR * distance
     return seeds.where((around & alike).sum(axis=1) >= _VOTES)
 
 
@@ -219,3 +219,12 @@ def _length(vectors: Array) -> Array:
     """Lengths [...] of vectors [...,2]."""
     length: Array = np.hypot(vectors[..., 0], vectors[..., 1])
     return length
+
+
+def _apart(here: Array, there: Array) -> Array:
+    """Distances [n,m] from each of `here` [n,2] to each of `there` [m,2]."""
+    x, y = (np.subtract.outer(here[:, k], there[:, k]) for k in (0, 1))
+    x *= x
+    y *= y
+    x += y
+    return np.sqrt(x, out=x)

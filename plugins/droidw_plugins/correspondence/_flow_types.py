@@ -118,6 +118,7 @@ class Edge:
         bridged: [h,w] cells that were taken out of the picture it starts in; None: none.
         searches: how often it was searched.
         blind: searched before geometry could be believed.
+        seeded: points matched by their descriptors were asked, too.
     """
 
     target: Array
@@ -126,6 +127,7 @@ class Edge:
     bridged: npt.NDArray[np.bool_] | None = None
     searches: int = 1
     blind: bool = False
+    seeded: bool = False
 
 
 @dataclass(frozen=True)
@@ -230,10 +232,12 @@ def held(power: Array) -> npt.NDArray[np.bool_]:
 
 
 def set_out_from(
-    known: tuple[Edge | Found, Edge | Found], starts: tuple[Array | None, Array | None]
+    known: tuple[Edge | Found, Edge | Found],
+    starts: tuple[Array | None, Array | None],
+    within: float = _SAME_START,
 ) -> bool:
-    """Whether searches both ways began at about these starts: free as they, or within a pixel."""
-    return all(_close(one.started, start) for one, start in zip(known, starts, strict=True))
+    """Whether searches both ways began at about these starts: free as they, or `within` cells."""
+    return all(_close(one.started, s, within) for one, s in zip(known, starts, strict=True))
 
 
 def taken_out_alike(
@@ -252,7 +256,7 @@ def taken_out_alike(
     return True
 
 
-def _close(one: Array | None, other: Array | None) -> bool:
+def _close(one: Array | None, other: Array | None, within: float) -> bool:
     if one is None or other is None:
         return one is other
-    return bool(np.median(np.abs(one - other)) < _SAME_START)
+    return bool(np.median(np.abs(one - other).max(axis=-1)) < within)

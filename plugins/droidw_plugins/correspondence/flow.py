@@ -73,6 +73,16 @@ class FlowOptions:
             "le": 31,
         },
     )
+    again_window: int = field(
+        default=9,
+        metadata={
+            "help": "width of the windows in which global bundle adjustment matches a pair again "
+            "that it has searched, if predictions have moved by less than half a cell since (below "
+            "3: it is searched again)",
+            "ge": 0,
+            "le": 31,
+        },
+    )
     consistency: float = field(
         default=0.5,
         metadata={"help": "forward-backward error at which confidence halves", "gt": 0.0},
