@@ -93,7 +93,7 @@ def test_other_masks_search_only_what_they_leave(operator, pair, searches):
 
 
 def test_another_start_is_another_search(operator, pair, searches):
-    part = operator(again_window=0)
+    part = operator()
     frames, made = pair(part), searches(part)
     start = ((frames[0].centres - part.offset) / part.stride).astype(np.float32)
     ask(part, frames, 4, start)

@@ -14,7 +14,6 @@ import numpy as np
 from droidw.geometry.contour import grown
 from droidw.interfaces.correspondence import Motion, Purpose
 from droidw.solve.weights import CLOSED
-from droidw_plugins.correspondence._flow_again import Windows, but_for_closed
 from droidw_plugins.correspondence._flow_check import Checks
 from droidw_plugins.correspondence._flow_exposure import as_bright
 from droidw_plugins.correspondence._flow_information import agreement, sample, structure
@@ -27,9 +26,9 @@ from droidw_plugins.correspondence._flow_mask import (
     without,
 )
 from droidw_plugins.correspondence._flow_motion import picture_motion
-from droidw_plugins.correspondence._flow_polish import polished
+from droidw_plugins.correspondence._flow_polish import SMALLEST, polished, polished_through
 from droidw_plugins.correspondence._flow_raster import Raster
-from droidw_plugins.correspondence._flow_search import DenseSearch
+from droidw_plugins.correspondence._flow_search import DenseSearch, seen_through
 from droidw_plugins.correspondence._flow_seeds import SeedBook, Seeds, drawn
 from droidw_plugins.correspondence._flow_session import FlowSession
 from droidw_plugins.correspondence._flow_types import (
@@ -59,6 +58,9 @@ _FULL_FIELDS = 64
 _TRACKED = 0.1
 # Grid flows kept for the filler: some ten kilobytes each.
 _GRID_FIELDS = 20_000
+# Cells by which predictions may have moved, in the median, since a pair was searched, for the next
+# search to be of what hardly moves.
+_NEAR_START = 0.5
 # Pixels between a seed and the flow that was found for which a search sets out from the seeds, and
 # how many times as sure a match of it has to be.
 _SEEDED = 1.5
@@ -83,7 +85,6 @@ class FlowCorrespondence:
         workers = options.workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="flow")
         self._dense = DenseSearch(options, self._raster)
-        self._windows = Windows(options, self._raster)
         self._checks = Checks(options, self._raster)
         self._latest: tuple[_Pair, Array] | None = None
         self._full: Kept[_Pair, Array] = Kept(_FULL_FIELDS)
@@ -184,7 +185,7 @@ class FlowCorrespondence:
         moved = None if start is None else sample(start, a.centres)
         grey = as_bright(b.grey, self._checks.gain(a, b, moved))
         if warped and start is not None:
-            return self._dense.warped(a.grey, grey, start, bend, fine=fine)
+            return self._dense.warped(a.grey, grey, start, bend, fine=fine, near=near)
         return self._dense(a.grey, grey, start, fine=fine, near=near)
 
     def _free(self, a: FlowFrame, b: FlowFrame) -> Array:
@@ -218,11 +219,15 @@ class FlowCorrespondence:
         Args:
             edge: what was found. start: targets [h,w,2] that are predicted, cells; None: unknown.
         """
-        if start is None or not self._windows.fill:
+        if start is None or not self.options.warp or self.options.fill_window < SMALLEST:
             return edge
         before = self._raster.moved(edge.target, a)
         gain = self._checks.gain(a, b, before)
-        moved = self._windows.cells(a, b, gain, start, before)
+        expected = self._raster.dense(start, a, settled=True, curved=self.options.curved).flow
+        there = self._raster.pixels(*a.grey.shape) + expected
+        seen = seen_through(as_bright(b.grey, gain), there)
+        window = self.options.fill_window
+        moved = polished_through(a.grey, seen, a.centres, before, expected, window)
         return self._checks.one_way(a, b, moved, gain)
 
     def both_ways(
@@ -238,8 +243,7 @@ class FlowCorrespondence:
     ) -> tuple[Edge, Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
-        What was found without about the same cells, from about the same start, is kept; if not
-        quite the same, windows go on from it (`again_window`), and else all is searched.
+        What was found without about the same cells, from about the same start, is kept.
 
         Args:
             a, b: frames. start_ab, start_ba: targets [h,w,2] to start from; None: free.
@@ -249,31 +253,17 @@ class FlowCorrespondence:
         """
         key, starts = (a.key, b.key, fine), (start_ab, start_ba)
         known, change = self._pairs.get(key), self.options.bridge_change
-        if known and seeded and not known[0].seeded:
-            known = None
-        if known and set_out_from(known, starts) and taken_out_alike(known, bridged, change):
+        near = known is not None and set_out_from(known, starts, _NEAR_START)
+        if (
+            known
+            and known[0].seeded >= seeded
+            and set_out_from(known, starts)
+            and taken_out_alike(known, bridged, change)
+        ):
             return replace(known[0]), replace(known[1])
-        if known and fine and self._windows.suffice(known, starts):
-            both = self._again(bridged, known, starts)
-        else:
-            both = self._searched((a, b), bridged, starts, fine, seeded)
+        both = self._searched((a, b), bridged, starts, fine, seeded, near)
         self._pairs.put(key, both)
         return replace(both[0]), replace(both[1])
-
-    def _again(
-        self,
-        frames: tuple[FlowFrame, FlowFrame],
-        known: tuple[Edge, Edge],
-        starts: tuple[Array | None, Array | None],
-    ) -> tuple[Edge, Edge]:
-        """Edges there and back between frames without what moves, from what was found before."""
-        (a, b), (ab, ba) = frames, known
-        flows = self._moved_on(a, b, starts[0], ab), self._moved_on(b, a, starts[1], ba)
-        there, back = self._checks.edges(frames, self._checks.found(frames, flows, starts))
-        share = self.options.bridged_share
-        return but_for_closed(there, ab, a.bridged, share), but_for_closed(
-            back, ba, b.bridged, share
-        )
 
     def _searched(
         self,
@@ -282,11 +272,16 @@ class FlowCorrespondence:
         starts: tuple[Array | None, Array | None],
         fine: bool,
         seeded: bool,
+        near: bool,
     ) -> tuple[Edge, Edge]:
-        """Edges there and back, as of `both_ways`, by a search of the pictures."""
+        """Edges there and back, as of `both_ways`, by a search of the pictures.
+
+        Args:
+            near: they were searched before from about these starts.
+        """
         a, b = bridged
-        whole = None if a.bridged is b.bridged is None else self._whole(frames, starts, fine)
-        flows = self._started(a, b, starts[0], fine), self._started(b, a, starts[1], fine)
+        whole = None if a.bridged is b.bridged is None else self._whole(frames, starts, fine, near)
+        flows = self._both_started(bridged, starts, fine, near)
         both = self._checks.edges(bridged, self._checks.found(bridged, flows, starts))
         if whole is not None:
             there, back = self._checks.edges(bridged, whole)
@@ -299,17 +294,12 @@ class FlowCorrespondence:
         there, back = (replace(e, bridged=f.bridged, seeded=seeded) for e, f in found)
         return there, back
 
-    def _moved_on(self, a: FlowFrame, b: FlowFrame, start: Array | None, edge: Edge) -> Array:
-        """Dense flow a -> b from the matches of an edge; of pairs for which windows suffice."""
-        assert start is not None
-        gain = self._checks.gain(a, b, self._raster.moved(edge.target, a))
-        return self._windows.dense(a, b, gain, start, edge)
-
     def _whole(
         self,
         frames: tuple[FlowFrame, FlowFrame],
         starts: tuple[Array | None, Array | None],
         fine: bool,
+        near: bool,
     ) -> tuple[Found, Found]:
         """What a search there and back between whole pictures comes to at the cells.
 
@@ -320,7 +310,7 @@ class FlowCorrespondence:
         known = self._plain.get(key)
         if known is not None and set_out_from(known, starts):
             return known
-        flows = self._started(a, b, starts[0], fine), self._started(b, a, starts[1], fine)
+        flows = self._both_started(frames, starts, fine, near)
         found = self._checks.found(frames, flows, starts)
         if not self.options.turn_reach:  # with the flow itself it would be too large
             self._plain.put(key, found)
@@ -353,12 +343,26 @@ class FlowCorrespondence:
             surer(edges[1], back, b.bridged, clearly=_CLEARLY),
         )
 
-    def _started(self, a: FlowFrame, b: FlowFrame, start: Array | None, fine: bool) -> Array:
+    def _both_started(
+        self,
+        frames: tuple[FlowFrame, FlowFrame],
+        starts: tuple[Array | None, Array | None],
+        fine: bool,
+        near: bool,
+    ) -> tuple[Array, Array]:
+        """Dense flow there and back from these targets."""
+        (a, b), (start_ab, start_ba) = frames, starts
+        return self._started(a, b, start_ab, fine, near), self._started(b, a, start_ba, fine, near)
+
+    def _started(
+        self, a: FlowFrame, b: FlowFrame, start: Array | None, fine: bool, near: bool
+    ) -> Array:
         """Dense flow a -> b from these targets; without, as the motion filter searches."""
         if start is not None:
             warped = fine and self.options.warp
             expected = self._raster.dense(start, a, settled=warped, curved=self.options.curved)
-            return self._search(a, b, expected.flow, fine, warped=warped, bend=expected.bend)
+            near = near and warped
+            return self._search(a, b, expected.flow, fine, near, warped, expected.bend)
         if a.bridged is None and b.bridged is None:
             return self._free(a, b)
         return self._search(a, b, None, fine)

@@ -41,16 +41,25 @@ class DenseSearch:
 
         Args:
             start: [H,W,2] from which patches set out; None: they stay where they are.
-            fine: as for global adjustment. near: from no coarser level than the start is good for.
+            fine: as for global adjustment. near: from no coarser level than the start is good for,
+                or, without one, than is needed for what hardly moves.
         """
-        kind = "free" if start is None else "near" if near else "started"
+        free, started = ("still", "near") if near else ("free", "started")
+        kind = free if start is None else started
         flow: Array = self._engine(kind, fine, a.shape).calc(
             a, b, None if start is None else start.copy()
         )
         return flow
 
     def warped(
-        self, a: Picture, b: Picture, expected: Array, bend: Array | None = None, *, fine: bool
+        self,
+        a: Picture,
+        b: Picture,
+        expected: Array,
+        bend: Array | None = None,
+        *,
+        fine: bool,
+        near: bool = False,
     ) -> Array:
         """The same, with `b` seen through the flow that is expected.
 
@@ -62,9 +71,10 @@ class DenseSearch:
 
         Args:
             expected: [H,W,2] pixels. bend: [H,W,2] second derivative of it; None: it has none.
+            fine: as for global adjustment. near: it is known to be about right.
         """
         pixels = self._raster.pixels(*a.shape)
-        rest = self(a, seen_through(b, pixels + expected), None, fine=fine, near=False)
+        rest = self(a, seen_through(b, pixels + expected), None, fine=fine, near=near)
         deviation = _PATCH * (self._options.patch_size << self._scale(fine))
         mean: Any = cv2.GaussianBlur(expected, (0, 0), deviation, borderType=cv2.BORDER_REPLICATE)
         flow: Array = rest + sample(mean, pixels + rest)
@@ -92,8 +102,10 @@ class DenseSearch:
             engine.setPatchSize(options.patch_size)
             engine.setPatchStride(options.patch_stride)
             room = min(shape) >> _NEAR_SCALE >= 2 * options.patch_size
-            if kind == "near" and room and hasattr(engine, "setCoarsestScale"):  # from 4.13 on
-                engine.setCoarsestScale(max(scale, _NEAR_SCALE))
+            coarsest = {"still": options.again_coarsest, "near": _NEAR_SCALE if room else None}
+            level = coarsest.get(kind)
+            if level is not None and hasattr(engine, "setCoarsestScale"):  # from 4.13 on
+                engine.setCoarsestScale(max(scale, level))
             setattr(self._local, name, engine)
         return engine
 

@@ -73,14 +73,14 @@ class FlowOptions:
             "le": 31,
         },
     )
-    again_window: int = field(
-        default=9,
+    again_coarsest: int = field(
+        default=0,
         metadata={
-            "help": "width of the windows in which global bundle adjustment matches a pair again "
-            "that it has searched, if predictions have moved by less than half a cell since (below "
-            "3: it is searched again)",
+            "help": "coarsest pyramid level (0: full size) of a search that global bundle "
+            "adjustment makes again, if predictions have moved by less than half a cell since: "
+            "coarser ones see what moves, and lead what is near it astray",
             "ge": 0,
-            "le": 31,
+            "le": 8,
         },
     )
     consistency: float = field(
