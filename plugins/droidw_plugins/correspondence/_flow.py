@@ -251,16 +251,12 @@ class FlowCorrespondence:
             bridged: both without what moves, or as they are; what is found there counts if surer.
             seeded: whether another search sets out from points matched by their descriptors.
         """
-        key, starts = (a.key, b.key, fine), (start_ab, start_ba)
+        key, starts = (a.key, b.key, fine, seeded), (start_ab, start_ba)
         known, change = self._pairs.get(key), self.options.bridge_change
-        near = known is not None and set_out_from(known, starts, _NEAR_START)
-        if (
-            known
-            and known[0].seeded >= seeded
-            and set_out_from(known, starts)
-            and taken_out_alike(known, bridged, change)
-        ):
+        if known and set_out_from(known, starts) and taken_out_alike(known, bridged, change):
             return replace(known[0]), replace(known[1])
+        before = known or self._pairs.get((a.key, b.key, fine, not seeded))
+        near = before is not None and set_out_from(before, starts, _NEAR_START)
         both = self._searched((a, b), bridged, starts, fine, seeded, near)
         self._pairs.put(key, both)
         return replace(both[0]), replace(both[1])
@@ -290,9 +286,7 @@ class FlowCorrespondence:
         if seeded:
             seeds = self._seeds.between(*frames, a.bridged, b.bridged)
             both = self._seeded(seeds, bridged, flows, both, fine)
-        found = zip(both, bridged, strict=True)
-        there, back = (replace(e, bridged=f.bridged, seeded=seeded) for e, f in found)
-        return there, back
+        return replace(both[0], bridged=a.bridged), replace(both[1], bridged=b.bridged)
 
     def _whole(
         self,

@@ -118,7 +118,6 @@ class Edge:
         bridged: [h,w] cells that were taken out of the picture it starts in; None: none.
         searches: how often it was searched.
         blind: searched before geometry could be believed.
-        seeded: points matched by their descriptors were asked, too.
     """
 
     target: Array
@@ -127,7 +126,6 @@ class Edge:
     bridged: npt.NDArray[np.bool_] | None = None
     searches: int = 1
     blind: bool = False
-    seeded: bool = False
 
 
 @dataclass(frozen=True)
