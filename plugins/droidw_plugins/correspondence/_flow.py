@@ -243,7 +243,8 @@ class FlowCorrespondence:
     ) -> tuple[Edge, Edge]:
         """Edges a -> b and b -> a, each checked against the other.
 
-        What was found without about the same cells, from about the same start, is kept.
+        What was found without about the same cells, from about the same start, is kept; what was
+        searched from nearly the same one is searched again without coarse levels.
 
         Args:
             a, b: frames. start_ab, start_ba: targets [h,w,2] to start from; None: free.
