@@ -80,7 +80,7 @@ def engines(monkeypatch):
 
 @pytest.mark.parametrize("change", [{"closed": 6}, {"off": 0.3}, {"closed": 6, "off": 0.3}])
 def test_what_was_searched_hardly_moves(operator, pair, engines, change):
-    part = operator()
+    part = operator(again_coarsest=0)
     frames, kinds = pair(part), engines(part)
     ask(part, frames, closed=4)
     assert set(kinds) == {"free"}
@@ -92,13 +92,14 @@ def test_what_was_searched_hardly_moves(operator, pair, engines, change):
 @pytest.mark.parametrize(
     ("options", "change", "kind"),
     [
+        ({"again_coarsest": 8}, {"off": 0.3}, "free"),
         ({}, {"off": 1.0}, "free"),  # farther off than a patch reaches
         ({}, {"off": 0.3, "fine": False}, "started"),  # while tracking
         ({"warp": False}, {"off": 0.3}, "started"),
     ],
 )
 def test_else_it_may_have_moved(operator, pair, engines, options, change, kind):
-    part = operator(**options)
+    part = operator(**{"again_coarsest": 0, **options})
     frames = pair(part)
     ask(part, frames, closed=4, fine=change.get("fine", True))
     kinds = engines(part)
@@ -107,7 +108,7 @@ def test_else_it_may_have_moved(operator, pair, engines, options, change, kind):
 
 
 def test_points_may_be_asked_of_what_hardly_moves(operator, pair, engines):
-    part = operator()
+    part = operator(again_coarsest=0)
     frames = pair(part)
     ask(part, frames)
     kinds = engines(part)

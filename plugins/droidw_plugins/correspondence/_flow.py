@@ -61,6 +61,8 @@ _GRID_FIELDS = 20_000
 # Cells by which predictions may have moved, in the median, since a pair was searched, for the next
 # search to be of what hardly moves.
 _NEAR_START = 0.5
+# `again_coarsest` that leaves out none.
+_ALL_LEVELS = 8
 # Pixels between a seed and the flow that was found for which a search sets out from the seeds, and
 # how many times as sure a match of it has to be.
 _SEEDED = 1.5
@@ -244,7 +246,7 @@ class FlowCorrespondence:
         """Edges a -> b and b -> a, each checked against the other.
 
         What was found without about the same cells, from about the same start, is kept; what was
-        searched from nearly the same one is searched again without coarse levels.
+        searched from nearly the same one is searched again as `again_coarsest` says.
 
         Args:
             a, b: frames. start_ab, start_ba: targets [h,w,2] to start from; None: free.
@@ -258,6 +260,7 @@ class FlowCorrespondence:
             return replace(known[0]), replace(known[1])
         before = known or self._pairs.get((a.key, b.key, fine, not seeded))
         near = before is not None and set_out_from(before, starts, _NEAR_START)
+        near = near and self.options.again_coarsest < _ALL_LEVELS
         both = self._searched((a, b), bridged, starts, fine, seeded, near)
         self._pairs.put(key, both)
         return replace(both[0]), replace(both[1])

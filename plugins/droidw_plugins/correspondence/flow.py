@@ -74,11 +74,11 @@ class FlowOptions:
         },
     )
     again_coarsest: int = field(
-        default=0,
+        default=8,
         metadata={
-            "help": "coarsest pyramid level (0: full size) of a search that global bundle "
-            "adjustment makes again, if predictions have moved by less than half a cell since: "
-            "coarser ones see what moves, and lead what is near it astray",
+            "help": "coarsest pyramid level (0: full size; 8: all there are) of a search that "
+            "global bundle adjustment makes again, if predictions have moved by less than half a "
+            "cell since: coarser ones see what moves, and may lead what is near it astray",
             "ge": 0,
             "le": 8,
         },
