@@ -78,7 +78,7 @@ def engines(monkeypatch):
     return watch
 
 
-@pytest.mark.parametrize("change", [{"closed": 6}, {"off": 0.3}, {"closed": 6, "off": 0.3}])
+@pytest.mark.parametrize("change", [{"closed": 6}, {"off": 0.4}, {"closed": 6, "off": 0.4}])
 def test_what_was_searched_hardly_moves(operator, pair, engines, change):
     part = operator(again_coarsest=0)
     frames, kinds = pair(part), engines(part)
@@ -92,10 +92,10 @@ def test_what_was_searched_hardly_moves(operator, pair, engines, change):
 @pytest.mark.parametrize(
     ("options", "change", "kind"),
     [
-        ({"again_coarsest": 8}, {"off": 0.3}, "free"),
-        ({}, {"off": 1.0}, "free"),  # farther off than a patch reaches
-        ({}, {"off": 0.3, "fine": False}, "started"),  # while tracking
-        ({"warp": False}, {"off": 0.3}, "started"),
+        ({"again_coarsest": 8}, {"off": 0.4}, "free"),
+        ({}, {"off": 1.5}, "free"),  # farther off than a patch reaches
+        ({}, {"off": 0.4, "fine": False}, "started"),  # while tracking
+        ({"warp": False}, {"off": 0.4}, "started"),
     ],
 )
 def test_else_it_may_have_moved(operator, pair, engines, options, change, kind):
@@ -112,7 +112,7 @@ def test_points_may_be_asked_of_what_hardly_moves(operator, pair, engines):
     frames = pair(part)
     ask(part, frames)
     kinds = engines(part)
-    ask(part, frames, off=0.3, seeded=True)
+    ask(part, frames, off=0.4, seeded=True)
     assert kinds[:2] == ["still", "still"]
 
 
@@ -121,7 +121,7 @@ def error(part, frames):
 
     Of rows of cells whose windows have nothing of the band.
     """
-    ask(part, frames, off=0.3)
+    ask(part, frames, off=0.4)
     edge, _ = ask(part, frames)
     off = part.stride * np.linalg.norm(edge.target - predicted(part, frames)[0], axis=-1)
     rows = [r for r, y in enumerate(frames[0].centres[:, 0, 1]) if 24 < y < 32 or 120 < y < 128]

@@ -257,4 +257,4 @@ def taken_out_alike(
 def _close(one: Array | None, other: Array | None, within: float) -> bool:
     if one is None or other is None:
         return one is other
-    return bool(np.median(np.abs(one - other).max(axis=-1)) < within)
+    return bool(np.median(np.abs(one - other)) < within)
