@@ -258,9 +258,10 @@ class FlowCorrespondence:
         known, change = self._pairs.get(key), self.options.bridge_change
         if known and set_out_from(known, starts) and taken_out_alike(known, bridged, change):
             return replace(known[0]), replace(known[1])
-        before = known or self._pairs.get((a.key, b.key, fine, not seeded))
-        near = before is not None and set_out_from(before, starts, _NEAR_START)
-        near = near and self.options.again_coarsest < _ALL_LEVELS
+        near = False
+        if self.options.again_coarsest < _ALL_LEVELS:
+            before = known or self._pairs.get((a.key, b.key, fine, not seeded))
+            near = before is not None and set_out_from(before, starts, _NEAR_START)
         both = self._searched((a, b), bridged, starts, fine, seeded, near)
         self._pairs.put(key, both)
         return replace(both[0]), replace(both[1])

@@ -47,10 +47,12 @@ class Raster:
         if settled:
             flow = _settled(flow)
         height, width = a.grey.shape
-        dense = self.between(flow, height, width)
+        x, y, across, down = self._placed_on(height, width)
+        dense = np.asarray(
+            cv2.remap(flow, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
+        )
         bend = None
         if curved:
-            *_, across, down = self._placed_on(height, width)
             dense, bend = _curved(dense, flow, across, down)
             bend /= np.float32(self._stride**2)
         return Expected(np.clip(dense, -2.0 * width, 2.0 * width), bend)
@@ -63,12 +65,6 @@ class Raster:
         """Where displacements [h,w,2] px put the cells of `a`, [h,w,2] in cells."""
         at: Array = ((a.centres + moved - self._offset) / self._stride).astype(np.float32)
         return at
-
-    def between(self, values: Array, height: int, width: int) -> Array:
-        """Values of cells [h,w,C] at all pixels [H,W,C], straight from one cell to the next."""
-        x, y, *_ = self._placed_on(height, width)
-        dense: Any = cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(dense, np.float32)
 
     def pixels(self, height: int, width: int) -> Array:
         """Coordinates x, y of all pixels, [H,W,2]."""
