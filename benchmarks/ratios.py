@@ -1,20 +1,24 @@
 """What moving things cost: cells of `droidw ablate` over those of the same clip without movers.
 
-    python benchmarks/ratios.py runs/ablations/unseen/cells.csv [MORE.csv ...]
+    python benchmarks/ratios.py runs/ablations/unseen/cells.csv [MORE.csv ...] [--save NAME]
 
 A clip with movers is called as the one without, an underscore, and what moves: `room4_camel` is
 held against `room4`. Means over seeds are geometric, and so are those over clips. Where there is a
-row `no-uncertainty`, the clips without movers are held against that as well.
+row `no-uncertainty`, all clips are held against that as well. `--save` also writes
+`results/NAME.md`.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import sys
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from statistics import geometric_mean
+
+from end_to_end import RESULTS, machine, today
 
 FULL, NONE = "full", "no-uncertainty"
 BySeed = Mapping[int, float]
@@ -61,7 +65,7 @@ def moving(error: ByCell, auc: ByCell) -> list[str]:
             least = min(auc[FULL, name].values())
             cells = [name, _list(full[name]), _list(full[other]), f"{ratios[-1]:.2f}"]
             out.append(_row([*cells, f"{least:.3f}"]))
-    return [*out, _row(["geometric mean", "", "", f"{mean(ratios):.2f}", ""])]
+    return [*out, _row(["geometric mean", "", "", f"{mean(ratios):.2f}", ""])] if out else []
 
 
 def standing(error: ByCell, auc: ByCell) -> list[str]:
@@ -72,7 +76,25 @@ def standing(error: ByCell, auc: ByCell) -> list[str]:
         if row == FULL and (FULL, name) not in auc and runs.keys() & none.keys():
             ratios.append(times(runs, none))
             out.append(_row([name, _list(runs), _list(none), f"{ratios[-1]:.2f}"]))
-    return [*out, _row(["geometric mean", "", "", f"{mean(ratios):.2f}"])]
+    return [*out, _row(["geometric mean", "", "", f"{mean(ratios):.2f}"])] if out else []
+
+
+def trusted(error: ByCell, auc: ByCell) -> list[str]:
+    """Rows of a table: clips with movers against the same with `uncertainty=none`."""
+    full = {sequence: runs for (row, sequence), runs in error.items() if row == FULL}
+    still = [name for name in full if (FULL, name) not in auc]
+    out = []
+    for name, runs in full.items():
+        none, other = error.get((NONE, name), {}), alone(name, still)
+        if name not in still and other is not None and runs.keys() & none.keys():
+            ratios = times(none, full[other]), times(runs, none)
+            out.append(_row([name, _list(runs), _list(none), *(f"{r:.3g}" for r in ratios)]))
+    return out
+
+
+def masks(auc: ByCell) -> list[str]:
+    """Rows of a table: uncertainty against motion masks, the least of all seeds."""
+    return [_row([n, f"{min(r.values()):.3f}"]) for (row, n), r in auc.items() if row == FULL]
 
 
 def _list(runs: BySeed) -> str:
@@ -84,16 +106,44 @@ def _row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def tables(error: ByCell, auc: ByCell) -> str:
+    """All tables as Markdown, but for those that would be empty."""
+    parts = [
+        (["movers", "ATE, mm", "without, mm", "times", "least AUC"], moving(error, auc)),
+        (
+            ["movers", "ATE, mm", "`none`, mm", "`none` over static", "of `none`"],
+            trusted(error, auc),
+        ),
+        (["nothing moves", "ATE, mm", "`none`, mm", "times"], standing(error, auc)),
+        (["masks", "least AUC"], masks(auc)),
+    ]
+    return "\n\n".join(
+        "\n".join([_row(heads), _row(["---"] + ["---:"] * (len(heads) - 1)), *rows])
+        for heads, rows in parts
+        if rows
+    )
+
+
+def save(name: str, text: str) -> Path:
+    """Tables, machine and date into `results/`; returns the file."""
+    facts = [_row([key, str(value)]) for key, value in machine().items()]
+    made = f"{today()}, made by `python benchmarks/ratios.py`; millimetres, ATE RMSE of all frames."
+    path = RESULTS / f"{name}.md"
+    lines = [f"# {name}", "", made, "", text, "", "| | |", "|---|---|", *facts]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def main(argv: Sequence[str] | None = None) -> None:
-    """Print both tables as Markdown."""
+    """Print the tables as Markdown."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("cells", type=Path, nargs="+", help="cells.csv of an ablation")
+    parser.add_argument("--save", metavar="NAME", help=f"also write into {RESULTS.name}/")
     asked = parser.parse_args(argv)
-    error, auc = read(asked.cells, "ate_rmse"), read(asked.cells, "masks.auc")
-    heads = ["movers", "ATE, mm", "without, mm", "times", "least AUC"]
-    print(_row(heads), _row(["---"] + ["---:"] * 4), *moving(error, auc), "", sep="\n")
-    heads = ["nothing moves", "ATE, mm", "`none`, mm", "times"]
-    print(_row(heads), _row(["---"] + ["---:"] * 3), *standing(error, auc), sep="\n")
+    text = tables(read(asked.cells, "ate_rmse"), read(asked.cells, "masks.auc"))
+    print(text)
+    if asked.save:
+        print(f"saved: {save(asked.save, text)}", file=sys.stderr)
 
 
 if __name__ == "__main__":
