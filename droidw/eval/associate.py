@@ -20,7 +20,7 @@ DEFAULT_MAX_DIFF = 0.02
 _COARSER, _LONGER = 30.0, 10.0
 # Numbers of frames are told from seconds by how much longer these would last; a reference that may
 # have a stamp a second, by how many frames there are as well, as a share of them.
-_AS_MANY, _MUCH_LONGER = 0.2, 3.0
+_AS_MANY, _MUCH_LONGER, _FEW = 0.2, 3.0, 10  # the last: pairs that are no more than chance
 _INDICES = "these look like frame indices"
 
 
@@ -95,7 +95,7 @@ def associate(
     pairs_est, pairs_ref = pairs_est[order], pairs_ref[order]
     if len(pairs_est) < minimum:
         raise _refusal(times_est, times_ref, len(pairs_est), minimum, max_diff)
-    if counted := _counted(times_est, times_ref):
+    if counted := _counted(times_est, times_ref, len(pairs_est)):
         said = f"{len(pairs_est)} pairs within {max_diff:g} s are there by chance alone"
         raise InputError(f"the time stamps do not match, {said}: {_INDICES}", _seconds(counted))
     return Association(
@@ -166,20 +166,27 @@ def _refusal(
         f"the time stamps do not match: {found} pairs within {max_diff:g} s, at least {minimum} "
         f"are needed; ref {span(ref)}, est {span(est)}"
     )
-    guess = _guess(est, ref)
+    guess = _guess(est, ref, minimum)
     return InputError(said + (f": {guess[0]}" if guess[0] else ""), guess[1])
 
 
-def _guess(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64]) -> tuple[str, str]:
+def _guess(
+    est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64], minimum: int
+) -> tuple[str, str]:
     """What the stamps look like, and what to do about it."""
     if not len(est) or not len(ref):
         return "", "give a trajectory with at least one pose a line: t tx ty tz qx qy qz qw"
+    for times, word in ((est, "estimate"), (ref, "reference")):
+        if len(np.unique(times)) < minimum:
+            return f"the {word} has fewer", "give one with more poses, each with a time of its own"
     # By steps and by how long it lasts: a clock that starts elsewhere, or a part, has the same.
     steps, spans = _spacing(est) / _spacing(ref), _lasting(est) / _lasting(ref)
     for factor, unit in ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")):
         for step, span, word in ((steps, spans, "estimate"), (1 / steps, 1 / spans, "reference")):
             coarser = factor / _COARSER < step < factor * _COARSER
-            if coarser and factor / _LONGER < span < factor * _LONGER:
+            # Nothing else has steps of a million seconds, however short the part of a sequence is.
+            longer = _LONGER if factor < 1e6 else _COARSER * _LONGER**2
+            if coarser and factor / longer < span < factor * longer:
                 return (
                     f"the {word} looks like {unit}",
                     f"divide the first column of the {word} by {factor:.0e}",
@@ -209,18 +216,19 @@ def _spacing(times: npt.NDArray[np.float64]) -> float:
     return float(np.median(steps)) if len(steps) else 1.0
 
 
-def _counted(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64]) -> str:
+def _counted(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64], pairs: int) -> str:
     """Which side has numbers of frames, while the other has seconds; empty: neither.
 
     As seconds they would last far longer. Truth can: a run may have ended early, and truth may have
-    a stamp a second; but not just as many seconds as the other side has frames.
+    a stamp a second; but not just as many seconds as the other side has frames, nor only a few
+    within all of them.
     """
     if len(est) < 2 or len(ref) < 2:
         return ""
     if _like_indices(est) and not _like_indices(ref):
         return "estimate" if est.max() > _MUCH_LONGER * np.ptp(ref) else ""
     if _like_indices(ref) and not _like_indices(est):
-        as_many = abs(ref.max() + 1 - len(est)) < _AS_MANY * len(est)
+        as_many = abs(ref.max() + 1 - len(est)) < _AS_MANY * len(est) or pairs < _FEW
         return "reference" if as_many and ref.max() > _MUCH_LONGER * np.ptp(est) else ""
     return ""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,10 @@ import numpy.typing as npt
 
 from droidw.errors import InputError
 from droidw.eval.associate import DEFAULT_MAX_DIFF, associate
+from droidw.io.images import list_images
+from droidw.io.listing import Entry, in_folder, read_listing
 from droidw.io.masks import numbers_in_names, seconds_in_names
+from droidw.io.notes import Notes
 
 __all__ = [
     "check_shape",
@@ -41,11 +43,12 @@ more."""
 def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
     """Masks by the index of their frame.
 
-    Frames are those of `rgb.txt` beside the folder, else of `rgb/` beside it, else of the source
-    alike, in order. A mask has the name of its frame, or a name that is its time in seconds. Where
-    no mask has such a name, they go by order if there are as many as frames, else by number, if
-    their names are indices of frames counted from 0. Where no frames are known, they go by number
-    if numbers are missing between theirs, else by order.
+    Frames are the pictures of the source, if that is known, else of the folder beside the masks, as
+    the readers of folders list them (`rgb.txt`; pictures right there, in `rgb/` or in `images/`). A
+    mask has the name of its frame, or a name that is its time in seconds. Where no mask has such a
+    name, they go by order if there are as many as frames, else by number, if their names are
+    indices of frames counted from 0. Where no frames are known, they go by number if numbers are
+    missing between theirs, else by order.
 
     Args:
         folder: of the masks. source: folder that the run was made from, if it is known.
@@ -58,17 +61,17 @@ def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
         raise InputError(f"{folder}: holds no masks", "expected pictures, white where it moves")
     by_stem = {path.stem: path for path in files}
     frames = frames_beside(folder, source)
-    named = {index: by_stem[name] for index, (name, _) in enumerate(frames) if name in by_stem}
+    named = {index: by_stem[name] for index, name, _ in frames if name in by_stem}
     if not named:
-        named = _by_time(files, [time for _, time in frames])
+        named = _by_time(files, frames)
     if named:
         return named
     if len(frames) == len(files):
-        return dict(enumerate(files))
+        return {index: path for (index, _, _), path in zip(frames, files, strict=True)}
     numbers = numbers_in_names(files)
     if len(numbers) == len(files):
         gaps = max(numbers) - min(numbers) + 1 > len(numbers)
-        if max(numbers) < len(frames) or (gaps and not frames):
+        if (frames and max(numbers) <= frames[-1][0]) or (gaps and not frames):
             return numbers
     if frames:
         raise InputError(
@@ -79,49 +82,58 @@ def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
     return dict(enumerate(files))
 
 
-def _by_time(files: Sequence[Path], times: Sequence[float]) -> dict[int, Path]:
+def _by_time(files: Sequence[Path], frames: Sequence[tuple[int, str, float]]) -> dict[int, Path]:
     """Masks whose names are seconds, by the index of the nearest frame; empty if they are not."""
     named = seconds_in_names(files)
-    if named is None or not times or not np.isfinite(times).all():
+    times = np.array([time for _, _, time in frames])
+    if named is None or not len(times) or not np.isfinite(times).all():
         return {}
     try:
-        found = associate(named, np.array(times), DEFAULT_MAX_DIFF)
+        found = associate(named, times, DEFAULT_MAX_DIFF)
     except InputError:
         return {}
-    return {int(ref): files[int(est)] for est, ref in zip(found.est, found.ref, strict=True)}
+    pairs = zip(found.est, found.ref, strict=True)
+    return {frames[int(ref)][0]: files[int(est)] for est, ref in pairs}
 
 
-def frames_beside(folder: Path, source: Path | None = None) -> list[tuple[str, float]]:
-    """Name and time (NaN if unknown) of the pictures beside a folder of masks, or in the source."""
-    for root in (folder.parent, source):
-        if root is None:
+def frames_beside(folder: Path, source: Path | None = None) -> list[tuple[int, str, float]]:
+    """Index, name and time (NaN if unknown) of the pictures of the source, else beside the masks.
+
+    Listed as the readers of folders list them, so that a picture has the index that a run gives it.
+    """
+    return [(index, path.stem, time) for index, time, path in _pictures(folder, source)]
+
+
+def _pictures(folder: Path, source: Path | None) -> list[Entry]:
+    for root in (source, folder.parent):
+        if root is None or not root.is_dir():
             continue
-        listing = root / "rgb.txt"
-        if listing.is_file():
-            lines = listing.read_text(encoding="utf-8", errors="replace").splitlines()
-            rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
-            return [(Path(row[1]).stem, _seconds(row[0])) for row in rows if len(row) > 1]
-        if (root / "rgb").is_dir():
-            return [(path.stem, math.nan) for path in pictures_in(root / "rgb")]
+        if (root / "rgb.txt").is_file():
+            try:
+                return read_listing(root / "rgb.txt", Notes([]))
+            except InputError:
+                continue
+        found = in_folder(root)
+        if found and (root == source or _go_with(found[0][2].parent, len(found), folder)):
+            return found
     return []
 
 
-def _seconds(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+def _go_with(pictures: Path, count: int, masks: Path) -> bool:
+    """Whether pictures beside masks can be theirs: no masks, and no few that only lie there."""
+    few = pictures == masks.parent and count < len(pictures_in(masks))
+    return pictures != masks and not few
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """The pictures of a folder, by name.
+    """The pictures of a folder, in natural order.
 
     Raises:
         InputError: if there is no such folder.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder")
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in _PICTURES)
+    return [path for path in list_images(folder) if path.suffix.lower() in _PICTURES]
 
 
 def shapes_shown(
@@ -139,12 +151,10 @@ def shapes_shown(
         found.append((width, height))
     except (OSError, ValueError, KeyError, TypeError):
         pass  # maps of another program, or of an older droidw
-    for root in (masks.parent, source):
-        if root is not None and (root / "rgb").is_dir():
-            for path in pictures_in(root / "rgb")[:1]:
-                picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-                if picture is not None:
-                    found.append((picture.shape[1], picture.shape[0]))
+    for _, _, path in _pictures(masks, source)[:1]:
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if picture is not None:
+            found.append((picture.shape[1], picture.shape[0]))
     return [(width, height) for width, height in found if width > 0 and height > 0]
 
 
@@ -187,15 +197,18 @@ def check_shape(
 def read_mask(path: Path) -> npt.NDArray[np.bool_]:
     """A mask [H,W] bool from a picture: True where it moves.
 
-    That is what is brighter than half, or has a colour, as where each object has one. Where nothing
-    is brighter than a few grey levels, these are numbers of objects, and all but 0 moves.
+    That is what is brighter than half, or has a colour, as where each object has one. Where values
+    have 16 bits, or nothing is brighter than a few grey levels, these are numbers of objects, and
+    all but 0 moves.
 
     Raises:
         InputError: if the file is no picture.
     """
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if picture is None:
         raise InputError(f"{path}: cannot be read as a picture")
+    if np.asarray(picture).dtype != np.uint8:
+        return np.asarray(np.asarray(picture).max(axis=2) > 0)
     brightest, darkest = np.asarray(picture).max(axis=2), np.asarray(picture).min(axis=2)
     if path.suffix.lower() in _LOSSY:  # its black is not clean, and its grey not without colour
         return np.asarray(brightest > _HALF)

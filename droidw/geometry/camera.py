@@ -18,12 +18,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from droidw.errors import InputError
+from droidw.geometry.sizes import SMALLEST, plan_size, working_size
 from droidw.slam.frame import Frame, RawFrame  # records only: imports nothing at run time
 
 __all__ = ["Camera", "Grid", "Rectifier", "working_size"]
 
 _COEFFICIENTS = {"pinhole": (0,), "opencv": (4, 5, 8), "fisheye": (4,)}
-_SMALLEST = 32
 
 
 @dataclass(frozen=True)
@@ -239,35 +239,6 @@ class Grid:
         return maps[..., rows, columns]
 
 
-def working_size(width: int, height: int, long_side: int, multiple: int = 8) -> tuple[int, int]:
-    """The size (w, h) at which a picture is worked on.
-
-    The picture is resized until its longer side is `long_side` (never enlarged), each side
-    rounded to a whole pixel; then a centred crop takes off up to `multiple - 1` pixels in all
-    per axis to reach multiples of `multiple`. Nothing is stretched to fit.
-
-    Raises:
-        InputError: less than 32 pixels would be left on a side.
-    """
-    return _plan(width, height, long_side, 0, multiple)[1]
-
-
-def _plan(
-    width: int, height: int, long_side: int, edge: int, multiple: int
-) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Size after resizing and size after cropping."""
-    scale = min(1.0, long_side / max(width, height))
-    resized = (max(1, round(width * scale)), max(1, round(height * scale)))
-    w, h = ((side - 2 * edge) // multiple * multiple for side in resized)
-    if min(w, h) < _SMALLEST:
-        raise InputError(
-            f"pictures of {width}x{height} pixels leave {max(w, 0)}x{max(h, 0)} pixels to work on",
-            f"at least {_SMALLEST} are needed on each side: give a larger camera.long_side "
-            f"(now {long_side}), a smaller camera.edge (now {edge}) or larger pictures",
-        )
-    return resized, (w, h)
-
-
 class Rectifier:
     """Undistorts, resizes and crops pictures, each once and in this order; thread-safe.
 
@@ -301,14 +272,14 @@ class Rectifier:
         if size is not None:
             working = (int(size[0]), int(size[1]))
             resized = (working[0] + 2 * edge, working[1] + 2 * edge)
-            if min(working) < _SMALLEST:
+            if min(working) < SMALLEST:
                 raise InputError(
                     f"a working size of {working[0]}x{working[1]} pixels is too small",
-                    f"at least {_SMALLEST} pixels are needed on each side (camera.size)",
+                    f"at least {SMALLEST} pixels are needed on each side (camera.size)",
                 )
         else:
             assert long_side is not None
-            resized, working = _plan(camera.width, camera.height, long_side, edge, 8)
+            resized, working = plan_size(camera.width, camera.height, long_side, edge, 8)
         self._resized = resized
         self._left = (resized[0] - working[0]) // 2
         self._top = (resized[1] - working[1]) // 2
@@ -342,41 +313,50 @@ class Rectifier:
         bottom, right = self._top + self.camera.height, self._left + self.camera.width
         return picture[self._top : bottom, self._left : right]
 
-    def rectify_mask(self, mask: npt.NDArray[np.bool_], name: str = "") -> npt.NDArray[np.bool_]:
+    def rectify_mask(
+        self, mask: npt.NDArray[np.bool_], name: str = "", *, working: bool = False
+    ) -> npt.NDArray[np.bool_]:
         """The mask [h,w] bool that lies on the working picture, from one of any size.
 
-        A mask of the working size is taken as it is; any other is enlarged or reduced to the raw
-        picture without blending, and then goes the way of the picture.
+        It is enlarged or reduced to the raw picture without blending, and then goes the way of the
+        picture. A mask of a working picture, or of the size of one alone, is laid on it as it is.
 
         Raises:
             InputError: the mask has another shape (ratio of its sides) than the picture.
         """
         height, width = mask.shape
-        if (width, height) == (self.camera.width, self.camera.height):
-            return np.array(mask, dtype=bool)
-        stretch = (width / height) / (self.raw.width / self.raw.height)
-        if not 0.98 < stretch < 1.02:
+        size, raw = (self.camera.width, self.camera.height), (self.raw.width, self.raw.height)
+        as_it_is = working or (width, height) == size != raw
+        shown = size if as_it_is else raw
+        if not 0.98 < (width / height) / (shown[0] / shown[1]) < 1.02:
             raise InputError(
                 f"a mask of {width}x{height} pixels{name and f' (picture {name})'} does not fit "
-                f"pictures of {self.raw.width}x{self.raw.height} pixels",
+                f"pictures of {shown[0]}x{shown[1]} pixels",
                 "masks may be of any size, but must show the whole picture: --masks DIR",
             )
         out = np.ascontiguousarray(mask, dtype=np.uint8)
+        if as_it_is:
+            return np.array(_nearest(out, size), dtype=bool)
         if self._maps is not None:
-            out = _nearest(out, (self.raw.width, self.raw.height))
+            out = _nearest(out, raw)
             # Fixed-point maps know no nearest neighbour; what is more than half masked counts.
             out = np.asarray(cv2.remap(out * 255, *self._maps, cv2.INTER_LINEAR) > 127, np.uint8)
         return np.array(self._crop(_nearest(out, self._resized)), dtype=bool)
 
-    def __call__(self, raw: RawFrame, mask: npt.NDArray[np.bool_] | None = None) -> Frame:
+    def __call__(
+        self, raw: RawFrame, mask: npt.NDArray[np.bool_] | None = None, *, working: bool = False
+    ) -> Frame:
         """The frame at working size, image [3,H,W] float32 in [0,1], with its mask, if any.
 
+        Args:
+            working: whether the mask is of a working picture, without distortion and edges.
         Raises:
             InputError: as `rectify_image` and `rectify_mask`.
         """
         image = torch.from_numpy(self.rectify_image(raw.image))
         planes = image.permute(2, 0, 1).to(torch.float32).div_(255.0).contiguous()
-        ignored = None if mask is None else torch.from_numpy(self.rectify_mask(mask, raw.name))
+        laid = None if mask is None else self.rectify_mask(mask, raw.name, working=working)
+        ignored = None if laid is None else torch.from_numpy(laid)
         return Frame(raw.index, raw.time, planes, self.camera.intrinsics(), raw.name, ignored)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from droidw.errors import InputError
+from droidw.io.images import list_images
 from droidw.slam.frame import RawFrame
 
 __all__ = ["UserMasks", "numbers_in_names", "seconds_in_names"]
@@ -26,16 +27,18 @@ class UserMasks:
 
     A mask belongs to the picture of the same name (`0012.png` to `0012.jpg`). Where the name of
     the first picture is not among the masks, they go by time if their names are seconds
-    (`1311868164.36.png`) and one is within 0.02 s of the first picture; else by order if there are
-    as many as pictures; else by number, if their names are indices of frames counted from 0
-    (`000012.png`, as droidw writes them). Masks that droidw wrote (`masks/scale.json` says so)
-    always go by number.
+    (`1311868164.36.png`) and one is within 0.02 s of the first picture; else by order, `10.png`
+    after `9.png`, if there are as many as pictures; else by number, if their names are indices of
+    frames counted from 0 (`000012.png`, as droidw writes them). Masks that droidw wrote
+    (`masks/scale.json` says so) always go by number.
 
     Args:
         folder: of pictures; black is used, everything else is ignored (a JPEG: what is brighter
             than half, since its black is not clean).
         least, most: how many pictures the source has, before any selection: at least, and at
             most; None where that is unknown.
+    Attributes:
+        working: whether droidw wrote the masks, so that they show its working pictures.
     Raises:
         InputError: the folder is not there or holds no masks.
     """
@@ -43,20 +46,20 @@ class UserMasks:
     def __init__(self, folder: Path, least: int = 0, most: int | None = None) -> None:
         if not folder.is_dir():
             raise InputError(f"input.masks: {folder}: there is no such folder", _SAYS)
-        files = [p for p in folder.iterdir() if p.suffix.lower() in (*_LOSSLESS, *_LOSSY)]
+        files = [p for p in list_images(folder) if p.suffix.lower() in (*_LOSSLESS, *_LOSSY)]
         if not files:
             raise InputError(f"input.masks: {folder}: holds no masks", _SAYS)
         self.folder = folder
         self._least, self._most = least, most
         self._asked: set[int] = set()
         self._missing: set[int] = set()
-        self._files = sorted(files)
+        self._whole: set[int] = set()
+        self._files = files
         self._by_name = {path.stem: path for path in self._files}
         self._times: npt.NDArray[np.float64] | None = None
-        self._by_index: dict[int, Path] | None = (
-            numbers_in_names(files) if _written_by_us(folder) else None
-        )
-        self._settled = self._by_index is not None
+        self.working = _written_by_us(folder)
+        self._by_index: dict[int, Path] | None = numbers_in_names(files) if self.working else None
+        self._settled = self.working
 
     def of(self, frame: RawFrame) -> npt.NDArray[np.bool_] | None:
         """The mask [H,W] of a picture, True where it is to be ignored; None if it has none.
@@ -75,7 +78,10 @@ class UserMasks:
         if picture is None:
             raise InputError(f"input.masks: {path}: cannot be read as a picture")
         least = 127 if path.suffix.lower() in _LOSSY else 0
-        return np.asarray((np.asarray(picture) > least).any(axis=2))
+        mask = np.asarray((np.asarray(picture) > least).any(axis=2))
+        if mask.all():
+            self._whole.add(frame.index)
+        return mask
 
     def _path(self, frame: RawFrame) -> Path | None:
         if self._times is not None:
@@ -88,6 +94,10 @@ class UserMasks:
     def _near(self, time: float, row: int) -> bool:
         assert self._times is not None
         return bool(abs(self._times[row] - time) <= _NEAR)
+
+    def hide_all(self) -> bool:
+        """Whether nothing is left of any picture that was asked for."""
+        return bool(self._asked) and self._whole == self._asked
 
     def problems(self) -> list[str]:
         """Sentences about pictures that had no mask."""

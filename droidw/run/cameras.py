@@ -11,10 +11,10 @@ from droidw.io.calib import read_calibration
 from droidw.io.masks import UserMasks
 
 if TYPE_CHECKING:
-    from droidw.config.schema import CameraConfig, InputConfig
+    from droidw.config.schema import CameraConfig, DroidwConfig, InputConfig
     from droidw.interfaces.datasets import FrameSource
 
-__all__ = ["GUESSED_FOV", "choose_camera", "open_masks"]
+__all__ = ["GUESSED_FOV", "choose_camera", "inputs_of", "open_masks", "why_unmatched"]
 
 GUESSED_FOV = 60.0
 """Horizontal field of view in degrees where nothing is known: between phones and webcams."""
@@ -90,3 +90,26 @@ def open_masks(config: InputConfig, source: FrameSource) -> UserMasks | None:
     # A stride hides how many pictures there are, but for a range.
     least = config.skip + (source.length - 1) * config.stride + 1
     return UserMasks(Path(config.masks), least, least + config.stride - 1)
+
+
+def inputs_of(config: DroidwConfig) -> dict[str, str]:
+    """What a run reads, by the key that names it."""
+    given = {
+        "input.source": config.input.source,
+        "input.masks": config.input.masks,
+        "camera.calib": config.camera.calib,
+    }
+    return {key: path for key, path in given.items() if path}
+
+
+def why_unmatched(masks: UserMasks | None) -> tuple[str, str]:
+    """Why nothing could be matched between pictures, as far as one knows, and what to do."""
+    if masks is not None and masks.hide_all():
+        return (
+            f"the masks in {masks.folder} hide all of them",
+            "what is not black in a mask is ignored: are they the other way about?",
+        )
+    return (
+        "they are blank, unrelated or without texture",
+        "look at the footage, or try a larger camera.long_side",
+    )

@@ -25,8 +25,8 @@ from droidw.io.tum import write_tum
 from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
 from droidw.run.again import Again, Hidden, again, second_time
-from droidw.run.cameras import choose_camera, open_masks
-from droidw.run.folder import listed, prepare, withdraw
+from droidw.run.cameras import choose_camera, inputs_of, open_masks, why_unmatched
+from droidw.run.folder import finish, listed, prepare
 from droidw.run.machine import run_device, settle
 from droidw.run.manifest import facts_of_setup, facts_of_time, facts_of_tracking, told
 from droidw.run.signals import Stop
@@ -74,10 +74,10 @@ def run(
         Interrupted: stopped by a signal, after what was tracked had been written.
     """
     device = run_device(resolved)
-    fresh = prepare(run_dir, overwrite)
+    fresh = prepare(run_dir, overwrite, inputs_of(resolved.config))
     with ExitStack() as stack:
-        # What is refused before anything was tracked leaves no folder that would be in the way.
-        stack.callback(withdraw, run_dir, fresh)
+        # What is refused before anything was tracked leaves no trace, and an earlier run as it was.
+        stack.callback(finish, run_dir, fresh)
         stack.enter_context(log_to_file(run_dir / "log.txt"))
         write_text(run_dir / "config.yaml", resolved.to_yaml())
         if note:
@@ -215,13 +215,16 @@ class _Run:
         while True:
             with self.clock("decode"):
                 raw = next(pending, None)
-                mask = None if raw is None or self.masks is None else self.masks.of(raw)
-                frame = None if raw is None else rectify(raw, mask)
+                frame = None if raw is None else self._rectified(raw, rectify)
                 if frame is not None and self.device.type == "cuda":
                     frame = replace(frame, image=frame.image.pin_memory())
             if frame is None:
                 return
             yield frame
+
+    def _rectified(self, raw: RawFrame, rectify: Rectifier) -> Frame:
+        masks = self.masks
+        return rectify(raw) if masks is None else rectify(raw, masks.of(raw), working=masks.working)
 
     def _track(
         self, system: SlamSystem, frames: Callable[[], Generator[Frame, None, None]]
@@ -272,11 +275,11 @@ class _Run:
         if failure is not None:
             raise failure
         if outcome.diagnosis.unmatched:
+            why, advice = why_unmatched(self.masks)
             raise TrackingError(
                 f"{self.config.input.source}: nothing could be matched between the "
-                f"{outcome.diagnosis.frames} frames: they are blank, unrelated or without texture",
-                f"{written}, all at the origin; look at the footage, or try a larger "
-                "camera.long_side",
+                f"{outcome.diagnosis.frames} frames: {why}",
+                f"{written}, all at the origin; {advice}",
             )
 
     # -- stages ----------------------------------------------------------------------------
@@ -381,12 +384,8 @@ class _Run:
         }
 
     def _facts_of_time(self, outcome: Outcome) -> dict[str, Any]:
-        return facts_of_time(
-            self.clock,
-            len(outcome.trajectory),
-            self.built - self.started,
-            time.perf_counter() - self.started,
-        )
+        built, now = self.built - self.started, time.perf_counter() - self.started
+        return facts_of_time(self.clock, len(outcome.trajectory), built, now)
 
     def _files(self) -> dict[str, Any]:
         """What lies in the run folder, and what each file means."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from droidw.errors import UsageError
 
-__all__ = ["FILES", "listed", "prepare", "withdraw"]
+__all__ = ["FILES", "finish", "listed", "prepare"]
 
 FILES: Mapping[str, str] = {
     "trajectory.tum": "pose of every input frame: t tx ty tz qx qy qz qw, camera to world",
@@ -26,16 +27,23 @@ FILES: Mapping[str, str] = {
 }
 """What a run leaves, by name within the run folder."""
 
+_WITHIN = ("depth/full",)
+_EARLIER = ".earlier"
+"""Folder in the run folder, of what an earlier run left there, until a new one has something."""
 
-def prepare(run_dir: Path, overwrite: bool) -> bool:
-    """Make the folder, or clear it of an earlier run.
 
-    Only files of an earlier run are ever deleted, and only with `overwrite`.
+def prepare(run_dir: Path, overwrite: bool, inputs: Mapping[str, str] | None = None) -> bool:
+    """Make the folder, or set aside what an earlier run left there.
 
+    Only files of an earlier run are ever touched, and only with `overwrite`; `finish` deletes them.
+
+    Args:
+        run_dir: the folder. overwrite: whether it may hold an earlier run.
+        inputs: key -> path of what this run reads, which must not be replaced.
     Returns:
         Whether the folder was not there before.
     Raises:
-        UsageError: the folder holds something, or cannot be written.
+        UsageError: the folder holds something, or cannot be written, or is read from.
     """
     fresh = not run_dir.exists()
     try:
@@ -69,23 +77,35 @@ def prepare(run_dir: Path, overwrite: bool) -> bool:
             f"{run_dir}: --overwrite replaces an earlier run, and this is none (it holds {shown})",
             "give another folder: -o FOLDER",
         )
-    for name in FILES:
-        _clear(run_dir / name)
+    for key, path in (inputs or {}).items():
+        if Path(path).exists() and Path(path).resolve().is_relative_to(run_dir.resolve()):
+            raise UsageError(
+                f"{key}: {path} lies in the output folder {run_dir}, of which --overwrite replaces "
+                "what an earlier run left",
+                "copy it to another place first, or give another folder: -o FOLDER",
+            )
+    finish(run_dir, fresh=False)  # of a run that was killed
+    _move(run_dir, run_dir / _EARLIER)
     return fresh
 
 
-def withdraw(run_dir: Path, fresh: bool) -> None:
-    """Take back the folder of a run that ended before it had anything to keep.
+def finish(run_dir: Path, fresh: bool) -> None:
+    """Delete what an earlier run left, if this one has something to keep; else leave no trace.
+
+    A run that is refused before it has tracked anything takes back its folder, or leaves the
+    earlier run as it was.
 
     Args:
         run_dir: as prepared. fresh: what `prepare` said.
     """
-    held = {entry.name for entry in run_dir.iterdir()}
-    if held <= {"config.yaml", "log.txt"}:
-        for name in held:
-            (run_dir / name).unlink()
-        if fresh:
+    earlier, own = run_dir / _EARLIER, _files(run_dir)
+    if {path.name for path in own} <= {"config.yaml", "log.txt"}:
+        for path in own:
+            path.unlink()
+        _move(earlier, run_dir)
+        if fresh and not any(run_dir.iterdir()):
             run_dir.rmdir()
+    shutil.rmtree(earlier, ignore_errors=True)
 
 
 def listed(run_dir: Path, later: Collection[str]) -> dict[str, str]:
@@ -97,11 +117,21 @@ def listed(run_dir: Path, later: Collection[str]) -> dict[str, str]:
     }
 
 
-def _clear(path: Path) -> None:
-    """Delete a file, or the files in an output folder; a link is only unlinked."""
-    if path.is_dir() and not path.is_symlink():
-        for entry in path.iterdir():
-            if entry.is_file() or entry.is_symlink():
-                entry.unlink()
-    else:
-        path.unlink(missing_ok=True)
+def _files(run_dir: Path) -> list[Path]:
+    """The files of a run that are in a folder; links as such, and no folders of somebody else."""
+    found = []
+    for name in (*FILES, *_WITHIN):
+        path = run_dir / name
+        inner = path.is_dir() and not path.is_symlink()
+        for entry in sorted(path.iterdir()) if inner else [path]:
+            if entry.is_symlink() or entry.is_file():
+                found.append(entry)
+    return found
+
+
+def _move(source: Path, target: Path) -> None:
+    """Move the files of a run, each to its place in another folder."""
+    for path in _files(source):
+        place = target / path.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        path.replace(place)

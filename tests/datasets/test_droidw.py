@@ -60,6 +60,11 @@ def test_truth_of_positions_alone(reader, trees, data):
     source = reader.open("droidw:downtown4", Selection())
     np.testing.assert_allclose(source.truth.centres[:, 0], np.arange(6))
     assert any("no orientation" in text for text in source.problems)
+    rows = (folder / "traj_gt.txt").read_text().splitlines()
+    rows.insert(2, f"{trees.START + 99} 9 9 9")  # one that strays costs no other
+    (folder / "traj_gt.txt").write_text("\n".join(rows) + "\n")
+    source = reader.open("droidw:downtown4", Selection())
+    np.testing.assert_allclose(source.truth.centres[:, 0], np.arange(6))
     (folder / "traj_gt.txt").write_text("a b c d\n")
     source = reader.open("droidw:downtown4", Selection())
     assert source.truth is None and any("not scored" in text for text in source.problems)

@@ -87,6 +87,26 @@ def test_a_clock_of_another_unit_may_start_anywhere_and_last_less_long(factor: f
         associate(seconds, part)
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1e9, "nano"), (1e6, "micro")])
+def test_a_short_part_does_not_hide_the_unit(factor: float, unit: str) -> None:
+    seconds = np.arange(1000) / 30
+    with pytest.raises(InputError, match=f"the reference looks like {unit}seconds"):
+        associate(seconds[:80], np.round(seconds * factor), minimum=3)
+
+
+def test_frame_indices_of_more_frames_than_were_tracked() -> None:
+    """Three of 80 frames are a whole second into the clip: that is no match of clocks."""
+    with pytest.raises(InputError, match=r"by chance alone: .* frame indices"):
+        associate(np.arange(80) / 30, np.arange(1000.0), minimum=3)
+
+
+@pytest.mark.parametrize("est", [[0.0, 0.1], [0.1, 0.1, 0.1, 0.1]])
+def test_too_few_poses_are_no_matter_of_clocks(est: list[float]) -> None:
+    with pytest.raises(InputError, match="the estimate has fewer") as caught:
+        associate(np.array(est), np.arange(30) / 10, minimum=3)
+    assert "--t-max-diff" not in caught.value.hint
+
+
 @pytest.mark.parametrize(
     ("est", "ref"),
     [

@@ -191,6 +191,77 @@ def test_masks_elsewhere_go_by_the_names_of_the_source(tmp_path: Path) -> None:
     assert find_masks(masks).keys() == {0, 1}
 
 
+NUMBERS = [str(number) for number in range(1, 13)]
+
+
+def _one_is_different(root: Path, names: list[str]) -> None:
+    """Mask and map of the last picture mark another part than those of all others."""
+    for number, name in enumerate(names):
+        share = 6 if number == len(names) - 1 else 2
+        mask, u = np.zeros((48, 64), np.uint8), np.full((6, 8), 1000, np.uint16)
+        mask[:, : 8 * share], u[:, :share] = 255, 40000
+        cv2.imwrite(str(root / "mask" / f"{name}.png"), mask)
+        cv2.imwrite(str(root / "uncertainty" / f"{number:06d}.png"), u)
+
+
+def test_numbers_without_zeros_go_as_pictures_do(tmp_path: Path) -> None:
+    root = folder(tmp_path, NUMBERS, listed=False)
+    _one_is_different(root, NUMBERS)
+    assert score_folder(root / "uncertainty", root / "mask").auc == 1.0
+    for path in (root / "mask").iterdir():  # by order
+        path.rename(path.with_name(f"m{path.name}"))
+    assert score_folder(root / "uncertainty", root / "mask").auc == 1.0
+
+
+@pytest.mark.parametrize("place", ["rgb", "images", "."])
+@pytest.mark.parametrize("suffix", ["jpg", "webp"])
+def test_pictures_are_listed_as_readers_do(tmp_path: Path, place: str, suffix: str) -> None:
+    root = folder(tmp_path, ["a b", "c", "d"], listed=False)
+    (root / place).mkdir(exist_ok=True)
+    for path in list((root / "rgb").iterdir()):
+        path.rename(root / place / f"{path.stem}.{suffix}")
+    (root / "mask" / "a b.png").unlink()
+    assert find_masks(root / "mask").keys() == {1, 2}
+    if place == ".":  # a picture that only lies there is no footage
+        (root / f"c.{suffix}").unlink()
+        (root / f"d.{suffix}").unlink()
+        assert find_masks(root / "mask").keys() == {0, 1}
+
+
+def test_masks_called_as_footage_are_none(tmp_path: Path) -> None:
+    masks = folder(tmp_path, ["a", "b"], listed=False) / "mask"
+    for path in (tmp_path / "rgb").iterdir():
+        path.unlink()
+    (masks / "a.png").unlink()
+    masks = masks.rename(tmp_path / "images")
+    with pytest.raises(InputError, match="the uncertainty maps go up to picture 1"):
+        score_folder(tmp_path / "uncertainty", masks)
+
+
+@pytest.mark.parametrize(
+    "listing",
+    [
+        "\ufeff# timestamp filename\n0.0 rgb/p.jpg\n0.1 rgb/q.jpg\n0.2 rgb/r.jpg\n",
+        "0.0,rgb/p.jpg\n0.1, rgb/q.jpg\n0.2,rgb/r.jpg\n",
+        "0.0 rgb/p.jpg\n0.1 rgb/q.jpg\n\n0.2 rgb/r.jpg  # the last\n",
+    ],
+    ids=["mark", "commas", "remark"],
+)
+def test_any_listing_that_runs_is_one_to_score(tmp_path: Path, listing: str) -> None:
+    root = folder(tmp_path, ["p", "q", "r"], listed=False)
+    (root / "rgb.txt").write_text(listing, encoding="utf-8")
+    (root / "mask" / "p.png").unlink()
+    assert find_masks(root / "mask").keys() == {1, 2}
+
+
+@pytest.mark.parametrize("value", [1, 3, 200, 255, 30000, 65535])
+def test_values_of_16_bits_are_numbers_of_objects(tmp_path: Path, value: int) -> None:
+    picture = np.zeros((4, 6), np.uint16)
+    picture[:, :3] = value
+    cv2.imwrite(str(tmp_path / "m.png"), picture)
+    assert np.array_equal(read_mask(tmp_path / "m.png"), picture > 0)
+
+
 def test_masks_by_number_where_some_are_missing(tmp_path: Path) -> None:
     for number in (3, 7, 9):
         cv2.imwrite(str(tmp_path / f"{number:06d}.png"), np.zeros((4, 4), np.uint8))

@@ -56,6 +56,20 @@ def test_by_order_where_there_are_as_many(folder):
     assert columns(UserMasks(several, 5, 6).of(frame(4))) == 5
 
 
+def test_the_order_is_that_of_pictures(folder):
+    """Nobody pads numbers with zeros: 10 comes after 9, as it does among pictures."""
+    masks = UserMasks(folder({f"{k}.png": k for k in range(1, 13)}), 12, 12)
+    found = [columns(masks.of(frame(k, f"frame{k + 1}.jpg"))) for k in range(12)]
+    assert found == list(range(1, 13))
+
+
+def test_hidden_files_are_no_masks(folder):
+    place = folder({"m1.png": 1, "m2.png": 2})
+    (place / "._m1.png").write_bytes(b"of a file manager")
+    masks = UserMasks(place, 2, 2)
+    assert [columns(masks.of(frame(k))) for k in range(2)] == [1, 2]
+
+
 def test_by_number_some_may_be_missing(folder):
     masks = UserMasks(folder({"000002.png": 2, "000005.png": 5}), 9, 9)
     assert masks.of(frame(0, "x.jpg")) is None
@@ -148,6 +162,31 @@ def test_a_mask_goes_the_way_of_its_picture(camera):
     # A mask at working size is one already.
     assert torch.equal(torch.from_numpy(rectify.rectify_mask(done.mask.numpy())), done.mask)
     assert rectify(RawFrame(0, 0.0, picture, "")).mask is None
+
+
+def test_a_mask_of_a_raw_picture_is_undistorted_though_nothing_is_resized():
+    """Both have 128x96 pixels: which of them a mask shows, only who wrote it tells."""
+    camera = Camera(128, 96, 110.0, 112.0, 63.0, 48.0, (-0.35, 0.12, 0.0, 0.0), "opencv")
+    rectify = Rectifier(camera, long_side=128)
+    picture = np.zeros((96, 128, 3), np.uint8)
+    cv2.circle(picture, (24, 22), 14, (255, 255, 255), -1)
+    done = rectify(RawFrame(0, 0.0, picture, ""), picture[..., 0] > 0)
+    seen = done.image[0] > 0.5
+    assert (done.mask != seen).sum() <= 0.05 * seen.sum()
+    working = done.mask.numpy()
+    assert (working != (picture[..., 0] > 0)).sum() > 0.2 * working.sum()
+    assert np.array_equal(rectify.rectify_mask(working, working=True), working)
+    larger = np.kron(working, np.ones((2, 2), bool))  # of a run at another size
+    assert np.array_equal(rectify.rectify_mask(larger, working=True), working)
+    with pytest.raises(InputError, match="does not fit pictures of 128x96"):
+        rectify.rectify_mask(working.T, working=True)
+
+
+def test_masks_that_droidw_wrote_show_its_working_pictures(folder):
+    place = folder({"000000.png": 3})
+    assert not UserMasks(place).working
+    (place / "scale.json").write_text(json.dumps({"named": "index"}))
+    assert UserMasks(place).working
 
 
 @pytest.mark.parametrize(("stride", "offset"), [(8, 3.5), (8, 0.0), (4, 1.5), (1, 0.0), (5, 2.0)])

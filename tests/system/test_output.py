@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from droidw.run.folder import finish, prepare
+
 RAISING = """
 import droidw
 
@@ -113,6 +115,56 @@ def test_a_filled_folder_needs_overwrite(go, footage):
     assert third.code == 0, third.err
     assert len(third.poses) == 3
     assert (first.folder / "notes.txt").read_text() == "mine"
+
+
+def contents(folder):
+    """Every file in a folder and below, with what is in it."""
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_refused_run_leaves_the_earlier_one_as_it_was(go, footage, tmp_path):
+    clip = footage(count=6)
+    first = go(clip.folder, "exporters.depth.full=true")
+    (first.folder / "depth" / "mine").mkdir()
+    (first.folder / "depth" / "mine" / "notes.txt").write_text("mine")
+    kept = contents(first.folder)
+    for wrong in (
+        (tmp_path / "mistyped",),
+        (clip.folder, "camera.calib=nowhere.txt"),
+        (clip.folder, "--masks", tmp_path / "nowhere"),
+    ):
+        again = go(*wrong, "--overwrite")
+        assert again.code == 3
+        assert contents(first.folder) == kept
+    done = go(clip.folder, "--max-frames", "3", "--overwrite")
+    assert done.code == 0, done.err
+    files = contents(first.folder)
+    assert len(done.poses) == 3 and len(files) < len(kept)
+    assert not [path for path in files if ".earlier" in path.parts or "full" in path.parts]
+    assert files[Path("depth/mine/notes.txt")] == b"mine"
+
+
+def test_what_a_run_reads_is_never_replaced(go, footage):
+    clip = footage(count=6)
+    first = go(clip.folder)
+    kept = contents(first.folder)
+    for key in ("input.masks", "camera.calib"):
+        again = go(clip.folder, f"{key}={first.folder / 'trajectory.tum'}", "--overwrite")
+        assert again.code == 2
+        assert f"{key}: {first.folder / 'trajectory.tum'} lies in the output folder" in again.err
+        assert contents(first.folder) == kept
+
+
+def test_a_killed_run_gives_back_what_it_had_set_aside(tmp_path):
+    """Killed before it had anything to keep, and the next one is refused as well."""
+    (tmp_path / "trajectory.tum").write_text("poses")
+    (tmp_path / "config.yaml").write_text("of the first")
+    assert prepare(tmp_path, overwrite=True) is False
+    (tmp_path / "config.yaml").write_text("of the killed one")
+    assert prepare(tmp_path, overwrite=True) is False
+    finish(tmp_path, fresh=False)
+    files = {path.name: text for path, text in contents(tmp_path).items()}
+    assert files == {"trajectory.tum": b"poses", "config.yaml": b"of the first"}
 
 
 def test_overwrite_spares_what_is_no_run(go, footage, tmp_path):

@@ -87,3 +87,13 @@ def test_masks_that_do_not_fit(go, postered, tmp_path):
     assert "a mask of 90x90 pixels (picture 0000.png) does not fit pictures of 160x120" in ran.err
     ran = go(clip.folder, "--masks", tmp_path / "none")
     assert ran.code == 3 and "there is no such folder" in ran.err
+
+
+def test_masks_that_hide_everything_are_named(go, postered):
+    """Black is used: masks that are the other way about leave nothing to see."""
+    clip, masks, _ = postered
+    for path in masks.iterdir():
+        cv2.imwrite(str(path), np.full((120, 160), 255, np.uint8))
+    ran = go(clip.folder, "--masks", masks, "--max-frames", "6")
+    assert ran.code == 4
+    assert f"the masks in {masks} hide all of them" in ran.err and "texture" not in ran.err

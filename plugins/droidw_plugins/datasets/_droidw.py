@@ -9,8 +9,9 @@ from pathlib import Path
 from droidw.errors import InputError
 from droidw.interfaces.datasets import Selection
 from droidw.io.images import list_images
+from droidw.io.listing import Entry, keep_rising
 from droidw.io.notes import Notes
-from droidw_plugins.datasets._listing import Entry, ListedSource, keep_rising
+from droidw_plugins.datasets._listing import ListedSource
 from droidw_plugins.datasets._named import Datasets
 from droidw_plugins.datasets._truth import at_pictures, read_positions
 

@@ -10,10 +10,11 @@ import numpy as np
 from droidw.errors import InputError
 from droidw.interfaces.datasets import Selection
 from droidw.io.images import list_images
+from droidw.io.listing import Entry, keep_rising
 from droidw.io.notes import Notes
 from droidw.slam.frame import Trajectory
 from droidw_plugins.datasets._colmap import read_poses
-from droidw_plugins.datasets._listing import Entry, ListedSource, keep_rising
+from droidw_plugins.datasets._listing import ListedSource
 from droidw_plugins.datasets._named import Datasets
 from droidw_plugins.datasets._truth import from_matrices
 

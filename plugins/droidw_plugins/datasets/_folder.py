@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import re
-from itertools import pairwise
+import math
 from pathlib import Path
-from statistics import median
 
 from droidw.errors import InputError
 from droidw.interfaces.datasets import Selection
 from droidw.io.calib import read_calibration
-from droidw.io.images import IMAGE_SUFFIXES, list_images
+from droidw.io.images import IMAGE_SUFFIXES
+from droidw.io.listing import Entry, in_folder, keep_rising, picture_folder, read_listing
 from droidw.io.notes import Notes
 from droidw_plugins.datasets._layout import VIDEO_SUFFIXES, looks_like_tum
-from droidw_plugins.datasets._listing import (
-    Entry,
-    ListedSource,
-    keep_rising,
-    read_listing,
-)
+from droidw_plugins.datasets._listing import ListedSource
 from droidw_plugins.datasets._named import existing_folder
 from droidw_plugins.datasets._truth import read_truth
 
 __all__ = ["FolderReader"]
 
-_SUBFOLDERS = ("rgb", "images")
 _EXPECTED = (
     "expected pictures (" + ", ".join(sorted(s[1:] for s in IMAGE_SUFFIXES)) + ") right in the "
     "folder or in rgb/ or images/ in it, or a list rgb.txt with lines `timestamp filename`"
@@ -46,7 +39,7 @@ class FolderReader:
         path = Path(source)
         if not source or not path.is_dir() or looks_like_tum(path):
             return False
-        if (path / "rgb.txt").is_file() or _picture_folder(path) is not None:
+        if (path / "rgb.txt").is_file() or picture_folder(path) is not None:
             return True
         return not any(entry.is_dir() for entry in path.iterdir())
 
@@ -70,39 +63,15 @@ class FolderReader:
         return out
 
     def _unlisted(self, path: Path, problems: list[str]) -> list[Entry]:
-        folder = _picture_folder(path)
-        if folder is None:
+        entries = in_folder(path)
+        if not entries:
             videos = sorted(p for p in path.iterdir() if p.suffix.lower() in VIDEO_SUFFIXES)
             hint = f"did you mean: droidw run {videos[0]}" if videos else _EXPECTED
             raise InputError(f"there is no picture in {path}", hint)
-        files = list_images(folder)
-        times = _times_in_names(files)
-        if times is not None:
-            order = sorted(range(len(files)), key=lambda i: times[i])
-            return [(n, times[i], files[i]) for n, i in enumerate(order)]
+        if not math.isnan(entries[0][1]):
+            return entries
         problems.append(
-            f"{folder} does not say when its pictures were taken: "
+            f"{entries[0][2].parent} does not say when its pictures were taken: "
             f"{self._fps:g} a second assumed (reader.options.fps)"
         )
-        return [(n, n / self._fps, file) for n, file in enumerate(files)]
-
-
-def _picture_folder(path: Path) -> Path | None:
-    """The folder itself or the one in it that has the pictures."""
-    for folder in (path, *(path / name for name in _SUBFOLDERS)):
-        if folder.is_dir() and list_images(folder):
-            return folder
-    return None
-
-
-def _times_in_names(files: list[Path]) -> list[float] | None:
-    """Times in seconds, if all names are decimal numbers that look like them.
-
-    They do if no two are the same and their usual distance is between 1 ms and 2 s.
-    """
-    if len(files) < 2 or not all(re.fullmatch(r"\d+\.\d+", file.stem) for file in files):
-        return None
-    times = [float(file.stem) for file in files]
-    rising = sorted(times)
-    gaps = [b - a for a, b in pairwise(rising)]
-    return times if min(gaps) > 0 and 0.001 <= median(gaps) <= 2.0 else None
+        return [(n, n / self._fps, file) for n, _, file in entries]

@@ -14,9 +14,10 @@ from droidw.geometry.camera import Camera
 from droidw.interfaces.datasets import Selection
 from droidw.io.files import read_text
 from droidw.io.images import list_images
+from droidw.io.listing import Entry, keep_rising
 from droidw.io.notes import Notes
 from droidw.slam.frame import Trajectory
-from droidw_plugins.datasets._listing import Entry, ListedSource, keep_rising
+from droidw_plugins.datasets._listing import ListedSource
 from droidw_plugins.datasets._named import Datasets, Place
 from droidw_plugins.datasets._truth import from_matrices
 

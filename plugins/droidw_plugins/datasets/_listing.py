@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import bisect
-import math
 from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from droidw.errors import InputError
-from droidw.io.files import read_text
 from droidw.io.images import read_image
+from droidw.io.listing import Entry
 from droidw.io.notes import Notes
 from droidw.io.prefetch import prefetch
 from droidw.slam.frame import RawFrame, Trajectory
@@ -20,81 +17,9 @@ if TYPE_CHECKING:
     from droidw.geometry.camera import Camera
     from droidw.interfaces.datasets import Selection
 
-__all__ = ["Entry", "ListedSource", "keep_rising", "read_listing"]
+__all__ = ["ListedSource"]
 
-Entry = tuple[int, float, Path]
 _PROBES = 5
-
-
-def read_listing(path: Path, notes: Notes) -> list[Entry]:
-    """Read `timestamp filename` lines; comments start with #.
-
-    Lines without a usable time or name are noted and count as skipped pictures.
-
-    Args:
-        path: the list; names in it are relative to its folder.
-        notes: receives a sentence per bad line.
-    Returns:
-        Entries with the position among all lines that are not comments.
-    Raises:
-        InputError: the file cannot be read or has no usable line.
-    """
-    entries: list[Entry] = []
-    position = 0
-    for number, line in enumerate(read_text(path, "lines `timestamp filename`").splitlines(), 1):
-        fields = line.split("#", 1)[0].replace(",", " ").split(maxsplit=1)
-        if not fields:
-            continue
-        fault = ""
-        try:
-            time = float(fields[0])
-        except ValueError:
-            fault = f"'{fields[0]}' is not a time in seconds"
-        else:
-            if not math.isfinite(time):
-                fault = f"'{fields[0]}' is not a time in seconds"
-        if not fault and len(fields) < 2:
-            fault = "no file name after the time"
-        if fault:
-            notes.skip(f"bad lines in {path.name}", f"{path.name}, line {number}: {fault}")
-        else:
-            entries.append((position, time, path.parent / fields[1].strip()))
-        position += 1
-    if not entries:
-        raise InputError(f"{path} names no picture", "lines look like `1.033333 rgb/000031.jpg`")
-    return entries
-
-
-def keep_rising(entries: Sequence[Entry], notes: Notes) -> list[Entry]:
-    """The longest part of the entries whose times strictly rise.
-
-    Pictures whose time repeats or runs backwards are left out and noted; taking the longest
-    part keeps a single stray time far in the future from costing all that follows.
-    """
-    tails: list[int] = []
-    times: list[float] = []
-    before: list[int] = [-1] * len(entries)
-    for i, (_, time, _) in enumerate(entries):
-        at = bisect.bisect_left(times, time)
-        before[i] = tails[at - 1] if at else -1
-        if at == len(times):
-            times.append(time)
-            tails.append(i)
-        elif time < times[at]:
-            times[at] = time
-            tails[at] = i
-    kept: set[int] = set()
-    i = tails[-1] if tails else -1
-    while i >= 0:
-        kept.add(i)
-        i = before[i]
-    for i, (_, time, path) in enumerate(entries):
-        if i not in kept:
-            notes.skip(
-                "pictures with a time that repeats or runs backwards",
-                f"{path.name}: its time {time!r} s repeats or runs backwards",
-            )
-    return [entry for i, entry in enumerate(entries) if i in kept]
 
 
 class ListedSource:

@@ -9,9 +9,10 @@ import numpy as np
 
 from droidw.errors import InputError
 from droidw.interfaces.datasets import Selection
+from droidw.io.listing import Entry, keep_rising, read_listing
 from droidw.io.notes import Notes
 from droidw.slam.frame import Trajectory
-from droidw_plugins.datasets._listing import Entry, ListedSource, keep_rising, read_listing
+from droidw_plugins.datasets._listing import ListedSource
 from droidw_plugins.datasets._named import Place
 from droidw_plugins.datasets._truth import near_pictures, read_truth
 
