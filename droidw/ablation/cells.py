@@ -14,7 +14,13 @@ import yaml
 from droidw.ablation.plan import Footage, Layer, Measuring, Plan
 from droidw.config.load import YAML_LOADER, load_config, override_layers
 from droidw.config.resolve import ResolvedConfig, choose_preset, resolve
-from droidw.errors import DroidwError, InputError, MissingRequirementError, PluginError
+from droidw.errors import (
+    ConfigError,
+    DroidwError,
+    InputError,
+    MissingRequirementError,
+    PluginError,
+)
 from droidw.io.dataset_tables import data_root, split_source, table_names
 from droidw.io.files import write_json, write_text
 
@@ -142,6 +148,7 @@ def make_cells(
                 # Resolving takes a while: what the first row takes of other seeds, others will.
                 seeds = plan.seeds if row == first and footage.vary else plan.seeds[:1]
                 layers = (_QUICK, plan.base, footage.layer, *said, row_layer)
+                _refuse_taken(layers, footage)
                 for seed in reversed(seeds):
                     varied = _varied(plan, footage, seed)
                     loaded = load_config(plan.config, chosen, (), None, (*layers, *varied))
@@ -164,12 +171,33 @@ def make_cells(
 
 def _varied(plan: Plan, footage: Footage, seed: int) -> Iterator[Layer]:
     """Layers of one seed, and of what varies with it."""
-    yield "ablation", {"seed": seed, "input": {"source": _place(footage.source)}}
+    yield "ablation", {"input": {"source": _place(footage.source)}}
+    yield f"{plan.file}: seeds", {"seed": seed}
     for key in footage.vary:
         value: Any = seed
         for name in reversed(key.split(".")):
             value = {name: value}
         yield f"{plan.file}: vary", value
+
+
+def _refuse_taken(layers: Sequence[Layer], footage: Footage) -> None:
+    """Refuse what every cell has of its own: set once more, it would change nothing.
+
+    Raises:
+        ConfigError: with the layer that sets it.
+    """
+    hints = dict.fromkeys(footage.vary, "it is in `vary`, so that each seed has its own")
+    hints |= {
+        "seed": "each cell has one of `seeds` in the file, or of --seeds",
+        "input.source": "each cell has that of its sequence: `sequences` in the file, --sequences",
+    }
+    for where, tree in layers:
+        for key, hint in hints.items():
+            part: Any = tree
+            for name in key.split("."):
+                part = part.get(name) if isinstance(part, Mapping) else None
+            if part is not None:
+                raise ConfigError(f"{where}: {key} cannot be set for cells", hint)
 
 
 def _place(source: str) -> str:

@@ -60,7 +60,7 @@ def _table(table: Table, column: Column) -> str:
         cells = [f"<td>{escape(row[0])}</td>"]
         for name, cell in zip(head[1:], row[1:], strict=True):
             css = " class='best'" if best.get(name) == row[0] else ""
-            css = " class='bad'" if cell == "failed" else css
+            css = " class='bad'" if cell in ("failed", "not run") else css
             cells.append(f"<td{css}>{escape(cell)}</td>")
         lines.append("<tr>" + "".join(cells) + "</tr>")
     return f"<table>{''.join(lines)}</table>"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -113,7 +114,7 @@ def load_plan(
     plan = Plan(
         file=reader.file,
         title=str(tree.get("title") or path.stem),
-        preset=str(tree.get("preset") or "auto"),
+        preset=_preset(reader),
         config=tuple(_config(name, path, reader) for name in reader.items("config", str, [])),
         base=(str(lines.get("base", reader.file)), reader.mapping("base")),
         sequences=_sequences(reader, data, sequences),
@@ -152,6 +153,17 @@ def _find(file: str) -> Path:
     )
 
 
+def _preset(reader: _Reader) -> str:
+    name, known = str(reader.tree.get("preset") or "auto"), [*packaged_in("presets"), "auto"]
+    if name in known or name.endswith((".yaml", ".yml")):
+        return name
+    raise reader.wrong(
+        "preset",
+        f"no preset is called '{name}'",
+        did_you_mean(name, known) + f"presets: {', '.join(known)}",
+    )
+
+
 def _config(name: str, file: Path, reader: _Reader) -> Path:
     packaged = packaged_configs()
     for candidate in (file.parent / name, packaged.get(name, file.parent / f"{name}.yaml")):
@@ -162,14 +174,16 @@ def _config(name: str, file: Path, reader: _Reader) -> Path:
 
 def _sequences(reader: _Reader, data: Path | None, chosen: Sequence[str]) -> dict[str, Footage]:
     given = reader.tree.get("sequences") or {}
-    if isinstance(given, list):
+    if reader.tree.get("sequences") == []:
+        layers: dict[str, Layer] = {}  # there are none, which is told of with what else is missing
+    elif isinstance(given, list):
         given = {str(name): {} for name in given}
-        layers: dict[str, Layer] = {name: (reader.file, {}) for name in given}
+        layers = {name: (reader.file, {}) for name in given}
         reader.check_names("sequences", given)
     else:
         layers = reader.layers("sequences")
     folder = data if data is not None else Path(str(reader.tree.get("data") or "."))
-    found = {}
+    found: dict[str, Footage] = {}
     for name in chosen or layers:
         where, tree = layers.get(name, ("--sequences", {}))
         source = str(tree.get("source") or name)
@@ -178,9 +192,20 @@ def _sequences(reader: _Reader, data: Path | None, chosen: Sequence[str]) -> dic
         rest = {key: value for key, value in tree.items() if key not in ("source", "vary")}
         full = f"sequences.{name}.vary" if "vary" in tree else "vary"
         vary = tuple(reader.names(tree.get("vary", reader.tree.get("vary", [])), full))
-        # A source of a reader, such as synthetic:orbit, is no name of a folder of cells.
-        found[re.sub(r"[^A-Za-z0-9._+-]", "-", name)] = Footage(source, (where, rest), vary)
+        found[_folder_name(name, found)] = Footage(source, (where, rest), vary)
     return found
+
+
+def _folder_name(name: str, taken: Collection[str]) -> str:
+    """A name of a folder of cells: a source of a reader, such as synthetic:orbit, is none itself.
+
+    Names stay apart of which only that is left which is alike: `my clip` and `my-clip`.
+    """
+    plain = re.sub(r"[^A-Za-z0-9._+-]", "-", name)
+    if _NAME.fullmatch(plain) and plain not in taken:
+        return plain
+    mark = hashlib.sha256(name.encode()).hexdigest()[:6]
+    return f"{plain.lstrip('._+-') or 'sequence'}-{mark}"
 
 
 def _needs(reader: _Reader) -> dict[str, float]:

@@ -16,6 +16,7 @@ __all__ = ["COLUMNS", "Column", "Entry", "Table", "make_table"]
 
 # Of an error that is shown, and after the point.
 _SIGNIFICANT, _MOST_DIGITS = 3, 8
+_NOT_RUN = "not run"
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ class Table:
         mine = [(c, o) for c, o in self.cells if (c.row, c.sequence) == (row, sequence)]
         values = [o.metrics[column] for _, o in mine if o is not None and column in o.metrics]
         errors = [
-            (o.error if o is not None else "") or c.missing or "not run"
+            (o.error if o is not None else "") or c.missing or _NOT_RUN
             for c, o in mine
             if o is None or o.error
         ]
@@ -134,18 +135,25 @@ class Table:
         """Cells that have no figures, and why."""
         found = []
         for cell, outcome in self.cells:
-            why = cell.missing or ("not run" if outcome is None else outcome.error)
+            why = cell.missing or (_NOT_RUN if outcome is None else outcome.error)
             if why:
                 found.append((cell, why))
         return found
 
     def remarks(self) -> list[tuple[str, str]]:
-        """What is to be known of figures: (column or cell, a sentence), in this order.
+        """What is to be known of figures: (column, sequence or cell, a sentence), in this order.
 
-        Columns that no cell has, and what runs with a result were warned of and measuring noted.
+        Columns that no cell has, sequences of which no cell has a result, and what runs with a
+        result were warned of and measuring noted.
         """
         shown = {column.key for column in self.columns}
         found = [(key, "no cell has this figure") for key in self.plan.columns if key not in shown]
+        known = {cell.sequence for cell, outcome in self.cells if outcome and not outcome.error}
+        found += [
+            (name, "no cell has a result: it is not in the tables, nor in their means")
+            for name in self.plan.sequences
+            if known and name not in known
+        ]
         for cell, outcome in self.cells:
             if outcome is None or outcome.error:
                 continue
@@ -204,7 +212,7 @@ class Table:
                     "seed": cell.seed,
                     "folder": f"cells/{cell.name}",
                     "digest": cell.digest,
-                    "error": cell.missing or ("not run" if outcome is None else outcome.error),
+                    "error": cell.missing or (_NOT_RUN if outcome is None else outcome.error),
                     "metrics": {} if outcome is None else dict(outcome.metrics),
                     "facts": {} if outcome is None else dict(outcome.facts),
                 }
@@ -216,6 +224,8 @@ class Table:
 def text(entry: Entry, column: Column) -> str:
     """An entry for a table: mean, spread, and how many seeds where some have none."""
     if entry.mean is None:
+        if set(entry.errors) == {_NOT_RUN}:
+            return _NOT_RUN
         return "failed" if entry.errors else "-"
     said = f"{entry.mean:.{column.digits}f}"
     if entry.spread is not None:

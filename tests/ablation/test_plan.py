@@ -148,6 +148,45 @@ def test_sequences_with_settings_and_sources(tmp_path, plugins):
     assert (config(cells[1])["input"]["skip"], cells[1].seed) == (7, 7)
 
 
+def test_names_of_sequences_stay_apart(tmp_path):
+    """Each has a folder of cells of its own, and none lies outside of the ablation's."""
+    file = tmp_path / "p.yaml"
+    file.write_text("rows: {full: {}}\n")
+    names = ["my clip", "my-clip", "a/b", "a-b", "日本", "韓国", "..", ".hidden"]
+    found = load_plan(str(file), tmp_path, names).sequences
+    assert [Path(f.source).name for f in found.values()] == [n.split("/")[-1] for n in names]
+    assert list(found)[:2] == ["my-clip", next(k for k in found if k.startswith("my-clip-"))]
+    assert all(name[0].isalnum() and "/" not in name for name in found)
+
+
+@pytest.mark.parametrize(
+    ("row", "more", "said"),
+    [
+        ({"seed": 4}, {}, "rows.r: seed cannot be set for cells"),
+        ({"input": {"source": "x"}}, {}, "rows.r: input.source cannot be set for cells"),
+        ({"input": {"skip": 3}}, {"vary": ["input.skip"]}, "rows.r: input.skip cannot be set"),
+        ({}, {"base": {"seed": 1}}, "base: seed cannot be set for cells"),
+    ],
+)
+def test_what_every_cell_has_of_its_own_is_refused(plan, plugins, row, more, said):
+    with pytest.raises(ConfigError, match="cannot be set for cells") as caught:
+        make_cells(plan({"full": {}, "r": row}, **more), plugins)
+    where = str(caught.value)
+    assert where.split(": ")[0].rpartition(":")[0].endswith("plan.yaml") or "base" in where
+    assert said.split(": ")[1] in where
+
+
+def test_a_seed_that_is_none_is_told_with_the_file(plan, plugins):
+    with pytest.raises(ConfigError, match=r"plan\.yaml: seeds: seed: -1 is out of range"):
+        make_cells(plan(["full"], seeds=[-1]), plugins)
+
+
+def test_a_seed_on_the_command_line_is_refused(plan, plugins):
+    with pytest.raises(ConfigError, match="seed cannot be set for cells") as caught:
+        make_cells(plan(["full"]), plugins, ("seed=3",))
+    assert "--seeds" in caught.value.hint
+
+
 def test_each_sequence_of_a_dataset_has_its_own_settings(tmp_path, plugins):
     file = tmp_path / "p.yaml"
     file.write_text(
@@ -217,6 +256,8 @@ def test_sequences_that_are_not_there(plan, plugins):
         ("rows: {a: {}}\n", "sequences: there is none"),
         ("sequences: [x]\n", "rows: there is none"),
         ("rows: {a: {}}\nsequences: [x]\nseeds: [a]\n", "seeds: ['a'] is no list of whole numbers"),
+        ("rows: {a: {}}\nsequences: []\n", "sequences: there is none"),
+        ("rows: {a: {}}\nsequences: [x]\npreset: cpuu\n", ":3: preset: no preset is called 'cpuu'"),
         ("rows: {a: {}}\nsequences: [x]\nmeasure: {align: sim2}\n", "measure.align: 'sim2'"),
         ("rows: {a: {}}\nsequences: [x]\nmeasure: {after: 2}\n", "measure.after: there is no such"),
         ("rows: {a: {}}\nsequences: [x]\nneeds: {gpu: 1}\n", "needs.gpu"),

@@ -89,6 +89,20 @@ def test_a_figure_that_not_every_sequence_has():
     assert "Without a result" in markdown(none) and make_page(none)
 
 
+def test_a_sequence_without_any_result_is_told(tmp_path):
+    found = table({("full", "a"): [1.0], ("full", "b"): ["x"]}, seeds=(0,))
+    assert ("b", "no cell has a result: it is not in the tables, nor in their means") in (
+        found.remarks()
+    )
+    nothing = table({("full", "a"): ["x"]}, seeds=(0,))
+    assert not [name for name, _ in nothing.remarks() if name == "a"]
+
+
+def test_what_has_not_run_has_not_failed():
+    found = table({("full", "a"): [1.0], ("r", "a"): [None]}, seeds=(0,))
+    assert found.grid(found.columns[0])[2] == ["r", "not run", "-"]
+
+
 def test_markdown():
     text = markdown(FULL, "droidw ablate p.yaml")
     lines = text.splitlines()
