@@ -26,6 +26,7 @@ __all__ = [
     "mask_score",
     "reference_file",
     "source_of",
+    "told_what_moves",
     "write_metrics",
 ]
 
@@ -103,10 +104,7 @@ def evaluate(
         # Nobody asked for the masks beside the footage: the trajectory is worth its figures.
         notes.append(f"masks are not scored: {error.message}")
     if found is not None and (given := _given_masks(run_dir)):
-        notes.append(
-            f"the run was told what moves (input.masks: {given}): the score of its uncertainty is "
-            "not of what it found by itself"
-        )
+        notes.append(told_what_moves(given))
     reference = reference or _known_reference(run_dir, source)
     if reference is None and found is not None:
         notes.append(f"only masks are scored: {_NO_REFERENCE}")
@@ -177,6 +175,14 @@ _NO_REFERENCE = (
     "no reference was given, and the run has no truth.tum and does not name a source with a "
     "groundtruth.txt"
 )
+
+
+def told_what_moves(masks: str) -> str:
+    """What is to be known of the mask score of a run that was given these masks."""
+    return (
+        f"the run was told what moves (input.masks: {masks}): the score of its uncertainty is "
+        "not of what it found by itself"
+    )
 
 
 def _given_masks(run_dir: Path | None) -> str:

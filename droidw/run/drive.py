@@ -17,6 +17,7 @@ import torch
 from droidw.errors import DroidwError, InputError, Interrupted, TrackingError
 from droidw.eval.masks import score_folder
 from droidw.eval.metrics import score
+from droidw.eval.summary import told_what_moves
 from droidw.events import Dispatcher, Progress, RunFailed, RunFinished, RunStarted
 from droidw.geometry.camera import Rectifier
 from droidw.io.files import write_json, write_text
@@ -29,10 +30,10 @@ from droidw.run.cameras import choose_camera, inputs_of, open_masks, why_unmatch
 from droidw.run.folder import finish, listed, prepare
 from droidw.run.machine import run_device, settle
 from droidw.run.manifest import facts_of_setup, facts_of_time, facts_of_tracking, told
+from droidw.run.parts import build_parts
 from droidw.run.signals import Stop
-from droidw.run.sources import open_source
+from droidw.run.sources import could_not_be_used, open_source
 from droidw.slam.frame import RunResult
-from droidw.slam.optimise import Parts
 from droidw.slam.records import Outcome
 from droidw.slam.system import SlamSystem
 from droidw.slam.timing import Stopwatch
@@ -161,7 +162,7 @@ class _Run:
         def build(hidden: Hidden | None) -> SlamSystem:
             return SlamSystem(
                 self.config if hidden is None else second_time(self.config),
-                self._build(),
+                build_parts(self.resolved, self.context),
                 rectify.camera,
                 self.device,
                 self.events,
@@ -284,19 +285,6 @@ class _Run:
 
     # -- stages ----------------------------------------------------------------------------
 
-    def _build(self) -> Parts:
-        def part(slot: str) -> Any:
-            component, options = self.resolved.parts[slot]
-            return component.factory(options, self.context)
-
-        return Parts(
-            features=part("features"),
-            depth=part("depth"),
-            uncertainty=part("uncertainty"),
-            ba=part("ba"),
-            correspondence=part("correspondence"),
-        )
-
     def _facts(self) -> dict[str, Any]:
         return {
             "camera": self.said,
@@ -307,11 +295,7 @@ class _Run:
     def _export(self, source: FrameSource, outcome: Outcome) -> RunResult:
         texts = [*outcome.diagnosis.warnings(), *(self.masks.problems() if self.masks else ())]
         texts += told(outcome.reports)
-        if source.skipped:
-            why = "; ".join(source.problems[:3])
-            texts.append(f"{source.skipped} pictures could not be used: {why}")
-        else:
-            texts += source.problems[:5]
+        texts += could_not_be_used(source)
         for text in texts:
             self.events.warn(text)
         truth = source.truth
@@ -365,7 +349,10 @@ class _Run:
         if not masks.is_dir() or not maps.is_dir():
             return metrics
         try:
-            return {**(metrics or {}), "masks": score_folder(maps, masks).to_dict()}
+            found = score_folder(maps, masks).to_dict()
+            if self.config.input.masks:
+                found["notes"] += [told_what_moves(self.config.input.masks)]
+            return {**(metrics or {}), "masks": found}
         except DroidwError as error:
             self.events.warn(f"the uncertainty was not scored: {error.message}")
             return metrics

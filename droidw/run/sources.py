@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from droidw.plugin.component import BuildContext
     from droidw.plugin.manager import Plugins
 
-__all__ = ["open_source"]
+__all__ = ["could_not_be_used", "open_source"]
 
 _log = logging.getLogger("droidw.run.drive")
 
@@ -69,3 +69,14 @@ def _unknown(source: str, readers: list[str]) -> InputError:
         f"{source}: {found}",
         f"a source is a folder of pictures, a video file, or reader:sequence\n{choose}",
     )
+
+
+def could_not_be_used(source: FrameSource) -> list[str]:
+    """Sentences about pictures of the source that were left out, and what else is to be known."""
+    if not source.skipped:
+        return source.problems[:5]
+    left_out = [text for text in source.problems if text.endswith("skipped")]
+    others = [text for text in source.problems if text not in left_out][:5]
+    what = "picture" if source.skipped == 1 else "pictures"
+    why = f": {'; '.join(left_out[:3])}" if left_out else ""
+    return [f"{source.skipped} {what} could not be used{why}", *others]

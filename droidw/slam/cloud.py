@@ -28,6 +28,7 @@ def consistent_depth(
     min_views: int,
     min_disp: float,
     published: bool = False,
+    measured: Tensor | None = None,
 ) -> Tensor:
     """Cells whose depth at least `min_views` neighbouring keyframes confirm, [N,h,w] bool.
 
@@ -38,7 +39,11 @@ def consistent_depth(
     Args:
         published: compare with keyframes 3, 4 and 5 ahead instead of 1, 2 and 3, a slip of the
             published code (REFERENCE 5.9), under `compat: [droid-w]`.
+        measured: [N,h,w] bool, cells whose matches had any weight; None: all. The others keep the
+            depth that they began with, about which neighbours agree as well: they neither are
+            confirmed nor confirm.
     """
+    known = store.disps if measured is None else store.disps.where(measured, torch.nan)
     count = len(store)
     height, width = store.grid.height, store.grid.width
     views = torch.zeros(count, height, width, dtype=torch.int64, device=store.device)
@@ -58,11 +63,11 @@ def consistent_depth(
                 x, y = x0 + dx, y0 + dy
                 inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
                 flat = (y.clamp(0, height - 1) * width + x.clamp(0, width - 1)).flatten(1)
-                seen = store.disps[jj].flatten(1).gather(1, flat).view_as(there)
+                seen = known[jj].flatten(1).gather(1, flat).view_as(there)
                 agrees |= inside & ((there * seen - 1.0).abs() < relative_threshold)
         views[first:last] += (agrees & valid).long()
     # A disparity at its lower bound is no measurement, however many views share it.
-    return (views >= min_views) & (store.disps > 1.01 * min_disp)
+    return (views >= min_views) & (known > 1.01 * min_disp)
 
 
 def static_cloud(

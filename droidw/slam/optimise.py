@@ -17,6 +17,7 @@ from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.interfaces.features import KnowsMovable
 from droidw.interfaces.uncertainty import Begins, Indices, UncertaintyView
+from droidw.slam.contract import energy_of
 from droidw.slam.seen_through import evidence
 from droidw.slam.upright import Upright
 from droidw.solve.epipolar import PointMatches, epipolar_term
@@ -112,10 +113,8 @@ class Optimiser:
         self.begun = self.anew = self.doubtful = False
         self._later = 1.0
         self.points: tuple[PointMatches, float] | None = None
-        self.iterations = 0
         self.reports: dict[str, int] = {}
-        self.cost = float("nan")
-        self.usual = 0.0
+        self.iterations, self.cost, self.usual = 0, float("nan"), 0.0
 
     def beside(self, store: KeyframeStore) -> Optimiser:
         """The same for another store, whose uncertainty begins with what this one has learned."""
@@ -396,5 +395,5 @@ class Optimiser:
         report = self.parts.uncertainty.update(self.view(ii, jj, target, confidence, frames, pairs))
         self.iterations += 1
         self._part()
-        if not math.isfinite(report.energy):
+        if not math.isfinite(energy_of(report)):
             self.reports["uncertainty"] = self.reports.get("uncertainty", 0) + 1

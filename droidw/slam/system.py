@@ -383,13 +383,14 @@ class SlamSystem:
         store, cloud = self.store, self.config.cloud
         if len(store) == 0:
             return (), static_cloud(store, torch.zeros(0), torch.zeros(0), cloud)
+        weight = self.optimiser.gates()
         valid = consistent_depth(
             store,
             cloud.relative_threshold,
             cloud.min_views,
             self.config.weighting.min_disp,
             published="droid-w" in self.config.compat,
+            measured=weight > 0,
         )
-        weight = self.optimiser.gates()
         records = keyframe_records(store, valid, weight)
         return records, static_cloud(store, valid, weight, cloud)

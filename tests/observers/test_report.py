@@ -21,7 +21,7 @@ from droidw.slam.frame import CloudPoints, RunResult, Trajectory
 from droidw_plugins.observers._cloud_view import splat
 from droidw_plugins.observers._pictures import choose, keyframe_pictures
 from droidw_plugins.observers._report_page import Report, build_page
-from droidw_plugins.observers._svg import nice_step
+from droidw_plugins.observers._svg import Line, nice_step, path_view
 from droidw_plugins.observers._truth import make_paths
 from droidw_plugins.observers.report import COMPONENT, ReportOptions
 
@@ -267,6 +267,16 @@ def test_choice_is_even() -> None:
     assert choose(100, 4) == [0, 33, 66, 99]
     assert choose(9, 1) == [4]
     assert choose(9, 0) == []
+
+
+def test_a_scale_bar_fits_its_figure():
+    """A path ten times as long as high is drawn larger from one side than from above."""
+    points = np.stack([np.linspace(0, 0.02, 40), np.linspace(0, 0.6, 40)], axis=1)
+    for shown in (points, points * 0.01, points[:, ::-1], points[:, :1].repeat(2, 1)):
+        drawn = path_view("a", ("x", "y"), [Line(shown, "est")], shown[:0], lambda u: f"{u:g} m")
+        bar = re.search(r'class="bar" d="M([\d.]+) [\d.]+v8M[\d.]+ [\d.]+h([\d.]+)m', drawn)
+        assert 40 < float(bar[2]) <= 468 / 3 + 0.01
+        assert re.search(r">[125]e?[-0-9.]* m<|>0\.0*[125] m<", drawn)
 
 
 def test_steps_are_round() -> None:

@@ -115,6 +115,18 @@ def test_unusable_pictures_in_the_middle(go, footage):
     assert "0007.png" in said and "0008.png" in said and "0012.png: 90x60" in said
 
 
+def test_one_unusable_picture_is_told_apart_from_other_things(go, footage):
+    clip = footage(count=12)
+    (clip.folder / "rgb.txt").unlink()
+    (clip.folder / "rgb" / "0007.png").write_bytes(b"\x89PNG and then nothing")
+    ran = go(clip.folder)
+    assert ran.code == 0, ran.err
+    said = ran.manifest["warnings"]
+    left_out = [text for text in said if "could not be used" in text]
+    assert left_out == ["1 picture could not be used: 0007.png: the file is cut short, skipped"]
+    assert any("does not say when its pictures were taken" in text for text in said)
+
+
 def test_one_frame(go, footage):
     clip = footage(count=1)
     ran = go(clip.folder, "observers.report={}")

@@ -262,3 +262,24 @@ def test_a_refused_input_leaves_no_folder_in_the_way(tmp_path):
     for _ in range(2):
         assert main(["run", str(tmp_path / "nowhere.mp4"), "-o", str(out)]) == 3
         assert not out.exists()
+
+
+NO_REPORT = NONSENSE.format(value="1.0").replace("return UncertaintyReport()", "pass")
+NO_FIELDS = NONSENSE.format(value="1.0").replace("fields =", "fieldz =")
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        (NO_REPORT, "`update` returned NoneType, no UncertaintyReport"),
+        (
+            NO_FIELDS,
+            "uncertainty model 'odd' breaks its contract: what its factory makes, a Odd, has",
+        ),
+    ],
+    ids=["no report", "no fields"],
+)
+def test_a_part_that_breaks_its_contract_is_named(go, footage, plugin, code, said):
+    ran = go(footage(count=14).folder, "--plugin", plugin(code), "uncertainty=odd")
+    assert ran.code == 5
+    assert said in ran.err and "bug of droidw" not in ran.err

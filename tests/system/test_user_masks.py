@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import cv2
 import numpy as np
 import pytest
@@ -97,3 +99,28 @@ def test_masks_that_hide_everything_are_named(go, postered):
     ran = go(clip.folder, "--masks", masks, "--max-frames", "6")
     assert ran.code == 4
     assert f"the masks in {masks} hide all of them" in ran.err and "texture" not in ran.err
+
+
+def test_no_depth_is_confirmed_where_nothing_was_measured(go, postered):
+    """Ignored cells keep the depth that they began with, and so do those of all neighbours."""
+    clip, masks, _ = postered
+    ran = go(clip.folder, "--masks", masks, "exporters.depth={}")
+    assert ran.code == 0, ran.err
+    maps = np.load(ran.folder / "depth" / "depth.npz")
+    assert maps["valid"][:, :, 10:].mean() > 0.3
+    assert not maps["valid"][:, :, :8].any()  # columns of the poster, 8 pixels each
+    pictures = [cv2.imread(str(p), -1) for p in sorted((ran.folder / "depth").glob("0*.png"))]
+    assert pictures and all((picture[:, :8] == 0).all() for picture in pictures)
+
+
+def test_a_score_of_masks_that_were_given_says_so(go, postered):
+    clip, masks, _ = postered
+    masks.rename(clip.folder / "mask")
+    more = ("observers.report={}", "exporters.uncertainty={maps: true, video: false}")
+    alone = go(clip.folder, *more, to="alone")
+    given = go(clip.folder, *more, "--masks", clip.folder / "mask", to="told")
+    assert alone.code == given.code == 0
+    for ran, known in ((alone, False), (given, True)):
+        notes = json.loads((ran.folder / "metrics.json").read_text())["masks"]["notes"]
+        assert any("was told what moves" in note for note in notes) == known
+        assert ("told by input.masks" in (ran.folder / "report.html").read_text()) == known

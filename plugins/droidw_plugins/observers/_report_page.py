@@ -24,7 +24,7 @@ from droidw_plugins.observers._report_facts import (
     timings,
     versions_used,
 )
-from droidw_plugins.observers._svg import Line, error_chart, nice_step, path_view
+from droidw_plugins.observers._svg import Line, error_chart, path_view
 from droidw_plugins.observers._truth import Paths, make_paths
 
 __all__ = ["Report", "build_page"]
@@ -158,19 +158,16 @@ def _tiles(result: RunResult, paths: Paths, metrics: Mapping[str, Any]) -> str:
         tiles.append(tile(f"{ate:.3g}", unit, "ATE RMSE", more))
     masks = metrics.get("masks")
     if isinstance(masks, Mapping) and number(masks.get("auc")) is not None:
-        tiles.append(tile(f"{masks['auc']:.3f}", "", "motion mask AUC"))
+        known = any("was told what moves" in str(note) for note in masks.get("notes", ()))
+        more = "told by input.masks" if known else ""
+        tiles.append(tile(f"{masks['auc']:.3f}", "", "motion mask AUC", more))
     return f'<div class="tiles">{"".join(tiles)}</div>'
 
 
 def _trajectory(paths: Paths) -> str:
     if not len(paths.centres):
         return section("Trajectory", '<p class="hint">There is no pose to show.</p>')
-    span = float(np.ptp(paths.centres, axis=0).max())
     least = 0.02 * paths.depth if paths.depth else 0.0
-    length = nice_step(max(span, least, 1e-9), 3)
-    label = f"{length:g} {paths.unit}" if paths.unit else f"{length:g}, scale arbitrary"
-    if paths.depth and not paths.unit:
-        label += f" ({100 * length / paths.depth:.2g} % of depth)"
     views = []
     for title, axes, up, names in (
         ("from above", (0, 2), 1.0, ("right", "forward")),
@@ -186,7 +183,7 @@ def _trajectory(paths: Paths) -> str:
             names,
             lines,
             paths.keyframes[:, axes] * flip,
-            (length, label),
+            paths.bar,
             least_span=least,
         )
         views.append(

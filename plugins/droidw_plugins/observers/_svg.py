@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,7 +44,7 @@ def path_view(
     axes: tuple[str, str],
     lines: list[Line],
     dots: Array,
-    bar: tuple[float, str],
+    bar: Callable[[float], str],
     least_span: float = 0.0,
     size: tuple[int, int] = (520, 380),
 ) -> str:
@@ -54,7 +55,8 @@ def path_view(
         axes: names of the horizontal and the upward axis.
         lines: paths; the last one is that of the estimate and carries the start and end marks.
         dots: [K,2] keyframes.
-        bar: length of the scale bar in the units of the points, and its label.
+        bar: label of a scale bar of this length in the units of the points. It is as long as suits
+            the figure: a third of its width at most.
         least_span: the figure shows at least this much, so that a still camera looks still.
         size: width and height of the figure in its own units.
     """
@@ -96,14 +98,15 @@ def path_view(
         parts.append(
             f'<rect class="end" x="{ex - 4.8:.1f}" y="{ey - 4.8:.1f}" width="9.6" height="9.6"/>'
         )
-    length = bar[0] * per_unit
+    units = nice_step(float(inner[0]) / per_unit, 3)
+    length, said = units * per_unit, bar(units)
     y = height - 14
     # Beside the bar, or above it where the name of the axis would be in the way.
-    beside = length + _CHARACTER * len(bar[1]) < 0.55 * width
+    beside = length + _CHARACTER * len(said) < 0.55 * width
     label = (margin + length + 10, y + 4) if beside else (margin, y - 10)
     parts += [
         f'<path class="bar" d="M{margin} {y - 4}v8M{margin} {y}h{length:.2f}m0 -4v8"/>',
-        f'<text class="note" x="{label[0]:.1f}" y="{label[1]:.1f}">{escape(bar[1])}</text>',
+        f'<text class="note" x="{label[0]:.1f}" y="{label[1]:.1f}">{escape(said)}</text>',
         f'<text class="note end-text" x="{width - 10}" y="{y + 4}">{escape(axes[0])} →</text>',
         f'<text class="note" x="10" y="18">↑ {escape(axes[1])}</text>',
         "</svg>",

@@ -49,6 +49,13 @@ class Paths:
         """Length of the estimated path in `unit`."""
         return float(np.linalg.norm(np.diff(self.centres, axis=0), axis=1).sum())
 
+    def bar(self, length: float) -> str:
+        """What is written at a scale bar of that length."""
+        if self.unit:
+            return f"{length:g} {self.unit}"
+        share = f" ({100 * length / self.depth:.2g} % of depth)" if self.depth else ""
+        return f"{length:g}, scale arbitrary{share}"
+
 
 def make_paths(result: RunResult) -> Paths:
     """Lay the truth, if there is any, on the estimate and turn both to the first camera's frame."""
