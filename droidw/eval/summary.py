@@ -14,6 +14,7 @@ from droidw.errors import InputError, UsageError
 from droidw.eval.associate import DEFAULT_MAX_DIFF
 from droidw.eval.metrics import Align, Delta, Normalise, TrajectoryScore, score
 from droidw.io.files import atomic_write
+from droidw.io.masks import written_by_droidw
 from droidw.io.tum import read_tum
 
 if TYPE_CHECKING:
@@ -105,6 +106,10 @@ def evaluate(
         notes.append(f"masks are not scored: {error.message}")
     if found is not None and (given := _given_masks(run_dir)):
         notes.append(told_what_moves(given))
+    if found is not None and masks is not None and written_by_droidw(masks):
+        notes.append(
+            f"the masks in {masks} are what a run of droidw found, not what is known to move"
+        )
     reference = reference or _known_reference(run_dir, source)
     if reference is None and found is not None:
         notes.append(f"only masks are scored: {_NO_REFERENCE}")

@@ -14,7 +14,7 @@ from droidw.errors import InputError
 from droidw.io.images import list_images
 from droidw.slam.frame import RawFrame
 
-__all__ = ["UserMasks", "numbers_in_names", "seconds_in_names"]
+__all__ = ["UserMasks", "numbers_in_names", "seconds_in_names", "written_by_droidw"]
 
 _LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
 _LOSSY = (".jpg", ".jpeg")
@@ -57,7 +57,7 @@ class UserMasks:
         self._files = files
         self._by_name = {path.stem: path for path in self._files}
         self._times: npt.NDArray[np.float64] | None = None
-        self.working = _written_by_us(folder)
+        self.working = written_by_droidw(folder)
         self._by_index: dict[int, Path] | None = numbers_in_names(files) if self.working else None
         self._settled = self.working
 
@@ -150,7 +150,7 @@ def seconds_in_names(files: Sequence[Path]) -> npt.NDArray[np.float64] | None:
     return times if len(times) == len(files) and np.isfinite(times).all() else None
 
 
-def _written_by_us(folder: Path) -> bool:
+def written_by_droidw(folder: Path) -> bool:
     """Whether the exporter wrote these masks, named by the index of the frame."""
     try:
         facts = json.loads((folder / "scale.json").read_text(encoding="utf-8"))

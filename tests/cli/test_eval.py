@@ -161,6 +161,19 @@ def test_a_run_that_was_told_what_moves(
         assert any("the run was told what moves" in note for note in notes) == told
 
 
+def test_masks_that_a_run_found_are_no_truth(
+    places: tuple[Path, Path], capsys: pytest.CaptureFixture
+) -> None:
+    run, source = places
+    for own in (False, True):
+        if own:
+            (source / "mask" / "scale.json").write_text(json.dumps({"named": "index"}))
+        given = ("--ref", source / "groundtruth.txt", "--masks", source / "mask", "--json")
+        assert run_eval(run, *given) == 0
+        notes = json.loads(capsys.readouterr().out)["notes"]
+        assert any("are what a run found" in note for note in notes) == own
+
+
 @pytest.mark.parametrize("named", [True, False], ids=["--masks", "mask/ of the source"])
 def test_masks_alone(places: tuple[Path, Path], named: bool, capsys: pytest.CaptureFixture) -> None:
     run, source = places
