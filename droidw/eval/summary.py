@@ -107,9 +107,7 @@ def evaluate(
     if found is not None and (given := _given_masks(run_dir)):
         notes.append(told_what_moves(given))
     if found is not None and masks is not None and written_by_droidw(masks):
-        notes.append(
-            f"the masks in {masks} are what a run of droidw found, not what is known to move"
-        )
+        notes.append(f"the masks in {masks} are what a run found, not what is known to move")
     reference = reference or _known_reference(run_dir, source)
     if reference is None and found is not None:
         notes.append(f"only masks are scored: {_NO_REFERENCE}")
