@@ -184,7 +184,7 @@ def _sequences(reader: _Reader, data: Path | None, chosen: Sequence[str]) -> dic
         layers = reader.layers("sequences")
     folder = data if data is not None else Path(str(reader.tree.get("data") or "."))
     found: dict[str, Footage] = {}
-    for name in chosen or layers:
+    for name in dict.fromkeys(chosen or layers):
         where, tree = layers.get(name, ("--sequences", {}))
         source = str(tree.get("source") or name)
         if ":" not in source and not Path(source).is_absolute():

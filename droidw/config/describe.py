@@ -12,6 +12,7 @@ from typing import Any, Literal, Union
 import yaml
 
 from droidw.config.inert import INERT
+from droidw.config.plain import plain
 from droidw.config.schema import DroidwConfig
 from droidw.plugin.registry import KINDS
 
@@ -148,9 +149,7 @@ def base_yaml(cls: type = DroidwConfig) -> str:
 
 
 def _flow(value: Any) -> str:
-    if isinstance(value, tuple):
-        value = list(value)
-    text = str(yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False))
+    text = str(yaml.safe_dump(plain(value), default_flow_style=True, width=10_000, sort_keys=False))
     return text.removesuffix("\n...\n").strip()
 
 

@@ -140,6 +140,10 @@ def override_layers(
     return [(_COMMAND_LINE, tree) for tree in sorted(said, key=lambda tree: not _chooses(tree))]
 
 
+# A date that is none, a tag that nobody knows, an alias of what it is part of.
+_NO_VALUE = (yaml.YAMLError, ValueError, RecursionError)
+
+
 class _Merger:
     """The tree under construction, with the source of each key."""
 
@@ -267,13 +271,14 @@ def _override(text: str) -> tuple[list[str], Any]:
         )
     try:
         node = yaml.compose(value, Loader=YAML_LOADER)
-    except yaml.YAMLError as error:
+        found = None if node is None else _Builder(_COMMAND_LINE).value(node, "")
+    except _NO_VALUE as error:
         raise UsageError(
             f"{_COMMAND_LINE}: {key}: the value {value!r} is not YAML: "
             + " ".join(str(error).split()),
             "quote it for the shell and for YAML, for example: 'input.source=\"a: b\"'",
         ) from error
-    return path, None if node is None else _Builder(_COMMAND_LINE).value(node, "")
+    return path, found
 
 
 def _nested(path: Sequence[str], value: Any) -> _Tree:
@@ -342,7 +347,12 @@ def read_yaml(path: Path) -> tuple[_Tree, dict[str, Source]]:
     if not isinstance(node, yaml.MappingNode):
         raise ConfigError(f"{shown}: a configuration holds `key: value` lines, not a bare value")
     builder = _Builder(shown)
-    return builder.value(node, ""), builder.lines
+    try:
+        return builder.value(node, ""), builder.lines
+    except _NO_VALUE as error:
+        last = next(reversed(builder.lines.values()), None)
+        told = " ".join(str(error).split())
+        raise ConfigError(f"{last or shown}: holds what is no value: {told}") from error
 
 
 class _Builder:

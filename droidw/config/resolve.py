@@ -5,12 +5,10 @@ Nothing heavy is loaded: a configuration is accepted or refused before any model
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import Enum
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -19,6 +17,7 @@ from droidw.config.check import check_keys, check_ranges, typed
 from droidw.config.inert import check_inert
 from droidw.config.load import LISTED, LoadedConfig, Source, load_config
 from droidw.config.packaged import packaged_in
+from droidw.config.plain import plain
 from droidw.config.schema import DroidwConfig
 from droidw.errors import (
     ConfigError,
@@ -27,6 +26,7 @@ from droidw.errors import (
     PluginError,
     did_you_mean,
 )
+from droidw.geometry.sizes import SMALLEST
 from droidw.plugin.component import Component
 from droidw.plugin.manager import Plugins
 from droidw.plugin.registry import FETCH, SLOTS, Entry, PluginNotFound
@@ -88,7 +88,7 @@ class ResolvedConfig:
             f"# {key}: {entry.component.name}, from {entry.origin}"
             for key, entry in self.origins.items()
         ]
-        body = yaml.safe_dump(_plain(self.config), sort_keys=False, allow_unicode=True)
+        body = yaml.safe_dump(plain(self.config), sort_keys=False, allow_unicode=True)
         return "\n".join(lines) + "\n" + str(body)
 
 
@@ -132,7 +132,7 @@ def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
         except _MISSING as error:
             problems.append(error)
             continue
-        chosen.options = _plain(options)
+        chosen.options = plain(options)
         parts[slot] = (part, options)
     listed: dict[str, list[Part]] = {}
     for section in LISTED:
@@ -153,7 +153,7 @@ def resolve(loaded: LoadedConfig, plugins: Plugins) -> ResolvedConfig:
             except _MISSING as error:
                 problems.append(error)
                 continue
-            getattr(config, section)[name] = _plain(options)
+            getattr(config, section)[name] = plain(options)
             listed[section].append((part, options))
     if problems:
         raise _joined(problems, loaded)
@@ -261,10 +261,10 @@ def _joined(problems: Sequence[DroidwError], loaded: LoadedConfig) -> DroidwErro
 def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
     """What types and ranges of single keys cannot say."""
     size = config.camera.size
-    if size and (len(size) != 2 or min(size) < 16):
+    if size and (len(size) != 2 or min(size) < SMALLEST):
         raise ConfigError(
             f"{loaded.at('camera.size')}: {size} is not a working size",
-            "valid: [width, height], each at least 16, or [] to follow camera.long_side",
+            f"valid: [width, height], each at least {SMALLEST}, or [] to follow camera.long_side",
         )
     said = [key for key in ("calib", "focal", "fov") if getattr(config.camera, key) is not None]
     if len(said) > 1:
@@ -337,16 +337,3 @@ def _running_on(plugins: Plugins, slot: str, device: str) -> str:
         if entry.kind == slot and device in entry.component.capabilities
     }
     return " or ".join(f"{slot}={name}" for name in sorted(fit)) or f"another part ({slot}=NAME)"
-
-
-def _plain(value: Any) -> Any:
-    """Dataclasses, tuples, enums and paths as what YAML has."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, Enum):
-        return value.name
-    return str(value) if isinstance(value, PurePath) else value

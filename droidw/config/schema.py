@@ -252,6 +252,6 @@ class DroidwConfig:
     )
 
     device: str = opt("auto", "auto, cpu, cuda, cuda:N")
-    seed: int = opt(0, "seed of everything that draws numbers", ge=0)
+    seed: int = opt(0, "seed of everything that draws numbers", ge=0, le=2**32 - 1)
     threads: int = opt(0, "cores to use, half of them for torch (0: all)", ge=0)
     compat: list[str] = opt([], "published behaviours to reproduce, e.g. [droid-w]")

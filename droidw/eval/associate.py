@@ -20,7 +20,9 @@ DEFAULT_MAX_DIFF = 0.02
 _COARSER, _LONGER = 30.0, 10.0
 # Numbers of frames are told from seconds by how much longer these would last; a reference that may
 # have a stamp a second, by how many frames there are as well, as a share of them.
-_AS_MANY, _MUCH_LONGER, _FEW = 0.2, 3.0, 10  # the last: pairs that are no more than chance
+_AS_MANY, _MUCH_LONGER = 0.2, 3.0
+# So few pairs say nothing of a reference that lasts so many times as long.
+_FEW, _HUGELY_LONGER = 10, 100.0
 _INDICES = "these look like frame indices"
 
 
@@ -220,16 +222,18 @@ def _counted(est: npt.NDArray[np.float64], ref: npt.NDArray[np.float64], pairs: 
     """Which side has numbers of frames, while the other has seconds; empty: neither.
 
     As seconds they would last far longer. Truth can: a run may have ended early, and truth may have
-    a stamp a second; but not just as many seconds as the other side has frames, nor only a few
-    within all of them.
+    a stamp a second; but not just as many seconds as the other side has frames, nor a hundred times
+    as long for a handful of pairs.
     """
     if len(est) < 2 or len(ref) < 2:
         return ""
     if _like_indices(est) and not _like_indices(ref):
         return "estimate" if est.max() > _MUCH_LONGER * np.ptp(ref) else ""
     if _like_indices(ref) and not _like_indices(est):
-        as_many = abs(ref.max() + 1 - len(est)) < _AS_MANY * len(est) or pairs < _FEW
-        return "reference" if as_many and ref.max() > _MUCH_LONGER * np.ptp(est) else ""
+        as_many = abs(ref.max() + 1 - len(est)) < _AS_MANY * len(est)
+        longer = ref.max() / max(float(np.ptp(est)), 1e-9)
+        chance = (as_many and longer > _MUCH_LONGER) or (pairs < _FEW and longer > _HUGELY_LONGER)
+        return "reference" if chance else ""
     return ""
 
 

@@ -13,6 +13,7 @@ import yaml
 from droidw.errors import InputError, UsageError
 from droidw.eval.associate import DEFAULT_MAX_DIFF
 from droidw.eval.metrics import Align, Delta, Normalise, TrajectoryScore, score
+from droidw.io.dataset_tables import table_names
 from droidw.io.files import atomic_write
 from droidw.io.masks import written_by_droidw
 from droidw.io.tum import read_tum
@@ -273,7 +274,10 @@ def source_of(run_dir: Path) -> Path | None:
             named.append(str(content.get("source", "")))
     named.append(str(_input_of(run_dir).get("source", "")))
     for text in named:
-        for candidate in (text, text.partition(":")[2]):
+        reader, _, rest = text.partition(":")
+        # `bonn:balloon` is a sequence by name, and not the folder balloon wherever one stands.
+        by_name = reader in table_names() and not Path(rest).is_absolute()
+        for candidate in (text, "" if by_name else rest):
             if candidate and Path(candidate).is_dir():
                 return Path(candidate)
     return None

@@ -326,9 +326,11 @@ class Rectifier:
         """
         height, width = mask.shape
         size, raw = (self.camera.width, self.camera.height), (self.raw.width, self.raw.height)
-        as_it_is = working or (width, height) == size != raw
-        shown = size if as_it_is else raw
-        if not 0.98 < (width / height) / (shown[0] / shown[1]) < 1.02:
+        as_it_is, shown = (width, height) == size != raw, raw
+        if working:  # at its size, it was cropped to whole cells or not
+            as_it_is = _stretch(mask, size) <= _stretch(mask, self._resized)
+            shown = size if as_it_is else self._resized
+        if (working or not as_it_is) and _stretch(mask, shown) > (0.05 if working else 0.02):
             raise InputError(
                 f"a mask of {width}x{height} pixels{name and f' (picture {name})'} does not fit "
                 f"pictures of {shown[0]}x{shown[1]} pixels",
@@ -337,7 +339,7 @@ class Rectifier:
         out = np.ascontiguousarray(mask, dtype=np.uint8)
         if as_it_is:
             return np.array(_nearest(out, size), dtype=bool)
-        if self._maps is not None:
+        if self._maps is not None and not working:
             out = _nearest(out, raw)
             # Fixed-point maps know no nearest neighbour; what is more than half masked counts.
             out = np.asarray(cv2.remap(out * 255, *self._maps, cv2.INTER_LINEAR) > 127, np.uint8)
@@ -358,6 +360,12 @@ class Rectifier:
         laid = None if mask is None else self.rectify_mask(mask, raw.name, working=working)
         ignored = None if laid is None else torch.from_numpy(laid)
         return Frame(raw.index, raw.time, planes, self.camera.intrinsics(), raw.name, ignored)
+
+
+def _stretch(mask: npt.NDArray[np.bool_], size: tuple[int, int]) -> float:
+    """By how much a mask has another ratio of sides than a size (width, height), as a share."""
+    height, width = mask.shape
+    return float(abs(width * size[1] / (height * size[0]) - 1.0))
 
 
 def _nearest(mask: npt.NDArray[np.uint8], size: tuple[int, int]) -> npt.NDArray[np.uint8]:

@@ -199,7 +199,7 @@ def _from_keys(path: Path, lines: _Lines, width: int, height: int) -> tuple[Came
 def _from_yaml(path: Path, text: str, width: int, height: int) -> tuple[Camera, str]:
     try:
         data = OmegaConf.to_container(OmegaConf.create(text))
-    except YAMLError as error:
+    except (YAMLError, AssertionError, ValueError) as error:
         mark = getattr(error, "problem_mark", None)
         where = f"{path}, line {mark.line + 1}" if mark is not None else str(path)
         raise InputError(f"{where}: not valid YAML", _VALID) from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import math
 import re
 from collections.abc import Sequence
@@ -14,13 +13,13 @@ from droidw.errors import InputError
 from droidw.io.files import read_text
 from droidw.io.images import list_images
 from droidw.io.notes import Notes
+from droidw.io.rising import longest_rising
 
 __all__ = [
     "PICTURE_FOLDERS",
     "Entry",
     "in_folder",
     "keep_rising",
-    "longest_rising",
     "picture_folder",
     "read_listing",
 ]
@@ -65,7 +64,7 @@ def read_listing(path: Path, notes: Notes) -> list[Entry]:
         if fault:
             notes.skip(f"bad lines in {path.name}", f"{path.name}, line {number}: {fault}")
         else:
-            entries.append((position, time, path.parent / fields[1].strip()))
+            entries.append((position, time, path.parent / fields[1].rstrip(", \t")))
         position += 1
     if not entries:
         raise InputError(f"{path} names no picture", "lines look like `1.033333 rgb/000031.jpg`")
@@ -86,28 +85,6 @@ def keep_rising(entries: Sequence[Entry], notes: Notes) -> list[Entry]:
                 f"{path.name}: its time {time!r} s repeats or runs backwards",
             )
     return [entry for i, entry in enumerate(entries) if i in kept]
-
-
-def longest_rising(values: Sequence[float]) -> list[int]:
-    """Where the longest part lies whose values strictly rise, in order."""
-    tails: list[int] = []
-    ends: list[float] = []
-    before: list[int] = [-1] * len(values)
-    for i, value in enumerate(values):
-        at = bisect.bisect_left(ends, value)
-        before[i] = tails[at - 1] if at else -1
-        if at == len(ends):
-            ends.append(value)
-            tails.append(i)
-        elif value < ends[at]:
-            ends[at] = value
-            tails[at] = i
-    kept = []
-    i = tails[-1] if tails else -1
-    while i >= 0:
-        kept.append(i)
-        i = before[i]
-    return kept[::-1]
 
 
 def in_folder(path: Path) -> list[Entry]:

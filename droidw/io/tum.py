@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from droidw.errors import InputError
 from droidw.io.files import atomic_write, read_text
+from droidw.io.rising import rising
 from droidw.slam.frame import Trajectory
 
 __all__ = ["read_tum", "write_tum"]
@@ -32,26 +34,30 @@ def read_tum(path: Path | str, *, problems: list[str] | None = None) -> Trajecto
             row is left.
     """
     path = Path(path)
-    rows: list[list[float]] = []
-    bad: list[str] = []
-    last = -math.inf
+    read: list[tuple[int, list[float]]] = []
+    bad: list[tuple[int, str]] = []
     for number, line in enumerate(read_text(path, "a trajectory in TUM format").splitlines(), 1):
         fields = line.split("#", 1)[0].replace(",", " ").split()
         if not fields:
             continue
         row, fault = _parse(fields)
-        if not fault and row[0] <= last:
-            relation = "repeats" if row[0] == last else "runs backwards from"
-            fault = f"time stamp {row[0]!r} {relation} {last!r}"
+        if not fault and problems is None and read:
+            fault = _not_after(row[0], read[-1][1][0])
+        if fault and problems is None:
+            raise InputError(f"{path}, line {number}: {fault}", _VALID)
         if fault:
-            if problems is None:
-                raise InputError(f"{path}, line {number}: {fault}", _VALID)
-            bad.append(f"{path.name}, line {number}: {fault}; row skipped")
-            continue
-        last = row[0]
-        rows.append(row)
+            bad.append((number, fault))
+        else:
+            read.append((number, row))
+    # One stray time costs no other row.
+    kept = rising([row[0] for _, row in read])
+    rows = [read[k][1] for k in kept]
     if problems is not None:
-        problems.extend(bad[:_SHOWN])
+        bad += _strays(read, kept)
+        said = [
+            f"{path.name}, line {number}: {fault}; row skipped" for number, fault in sorted(bad)
+        ]
+        problems.extend(said[:_SHOWN])
         if len(bad) > _SHOWN:
             problems.append(f"{path.name}: {len(bad) - _SHOWN} more bad rows skipped")
     if not rows:
@@ -59,6 +65,25 @@ def read_tum(path: Path | str, *, problems: list[str] | None = None) -> Trajecto
     table = np.array(rows, dtype=np.float64)
     table[:, 4:] /= np.linalg.norm(table[:, 4:], axis=1, keepdims=True)
     return Trajectory(times=table[:, 0].copy(), T_wc=table[:, 1:].copy())
+
+
+def _not_after(time: float, last: float) -> str:
+    """What is wrong with a time after that one; "" if nothing."""
+    relation = "repeats" if time == last else "runs backwards from"
+    return f"time stamp {time!r} {relation} {last!r}" if time <= last else ""
+
+
+def _strays(
+    read: Sequence[tuple[int, list[float]]], kept: Sequence[int]
+) -> Iterator[tuple[int, str]]:
+    """Line and fault of the rows that were not kept."""
+    last, among = -math.inf, set(kept)
+    for k, (number, row) in enumerate(read):
+        if k in among:
+            last = row[0]
+        else:
+            ahead = f"time stamp {row[0]!r} lies ahead of the rows after it"
+            yield number, _not_after(row[0], last) or ahead
 
 
 def _parse(fields: list[str]) -> tuple[list[float], str]:

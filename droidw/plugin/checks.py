@@ -6,7 +6,7 @@ import dataclasses
 import re
 import sys
 import zlib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from importlib import util
 from pathlib import Path
 from types import ModuleType
@@ -66,7 +66,8 @@ def problem_of(item: object) -> str:
             return f"'{record.name}': option '{entry.name}' has no default"
     for attribute in ("requires", "capabilities"):
         value = getattr(record, attribute)
-        if isinstance(value, str) or not all(isinstance(part, str) for part in value):
+        several = isinstance(value, Collection) and not isinstance(value, str)
+        if not several or not all(isinstance(part, str) for part in value):
             return f"'{record.name}': {attribute} is {value!r}, not a collection of strings"
     return _problem_of_weights(record)
 

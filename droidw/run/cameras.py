@@ -98,8 +98,9 @@ def inputs_of(config: DroidwConfig) -> dict[str, str]:
         "input.source": config.input.source,
         "input.masks": config.input.masks,
         "camera.calib": config.camera.calib,
+        "depth.options.path": config.depth.options.get("path"),
     }
-    return {key: path for key, path in given.items() if path}
+    return {key: path for key, path in given.items() if path and isinstance(path, str)}
 
 
 def why_unmatched(masks: UserMasks | None) -> tuple[str, str]:

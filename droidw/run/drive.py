@@ -27,7 +27,7 @@ from droidw.log import log_to_file
 from droidw.plugin.component import BuildContext
 from droidw.run.again import Again, Hidden, again, second_time
 from droidw.run.cameras import choose_camera, inputs_of, open_masks, why_unmatched
-from droidw.run.folder import finish, listed, prepare
+from droidw.run.folder import RunFolder, listed, prepare
 from droidw.run.machine import run_device, settle
 from droidw.run.manifest import facts_of_setup, facts_of_time, facts_of_tracking, told
 from droidw.run.parts import build_parts
@@ -75,16 +75,16 @@ def run(
         Interrupted: stopped by a signal, after what was tracked had been written.
     """
     device = run_device(resolved)
-    fresh = prepare(run_dir, overwrite, inputs_of(resolved.config))
+    folder = prepare(run_dir, overwrite, inputs_of(resolved.config))
     with ExitStack() as stack:
         # What is refused before anything was tracked leaves no trace, and an earlier run as it was.
-        stack.callback(finish, run_dir, fresh)
-        stack.enter_context(log_to_file(run_dir / "log.txt"))
-        write_text(run_dir / "config.yaml", resolved.to_yaml())
+        stack.callback(folder.finish)
+        stack.enter_context(log_to_file(folder.early("log.txt")))
+        write_text(folder.early("config.yaml"), resolved.to_yaml())
         if note:
             _log.info(note)
         stop = stack.enter_context(Stop())
-        return _Run(resolved, plugins, run_dir, device, stop, note).go()
+        return _Run(resolved, plugins, folder, device, stop, note).go()
 
 
 class _Run:
@@ -94,12 +94,13 @@ class _Run:
         self,
         resolved: ResolvedConfig,
         plugins: Plugins,
-        run_dir: Path,
+        folder: RunFolder,
         device: torch.device,
         stop: Stop,
         note: str,
     ) -> None:
-        self.resolved, self.plugins, self.run_dir = resolved, plugins, run_dir
+        self.resolved, self.plugins, self.folder = resolved, plugins, folder
+        self.run_dir = folder.path
         self.config, self.device, self.stop, self.note = resolved.config, device, stop, note
         self.started = time.perf_counter()
         self.sweeps = self.kept = 1
@@ -110,7 +111,7 @@ class _Run:
             seed=self.config.seed,
             weights_dir=plugins.weights_dir,
             data_dir=plugins.data_dir,
-            run_dir=run_dir,
+            run_dir=folder.path,
             compat=frozenset(self.config.compat),
             disabled=plugins.disabled(),
         )
@@ -293,6 +294,7 @@ class _Run:
         }
 
     def _export(self, source: FrameSource, outcome: Outcome) -> RunResult:
+        self.folder.begin()
         texts = [*outcome.diagnosis.warnings(), *(self.masks.problems() if self.masks else ())]
         texts += told(outcome.reports)
         texts += could_not_be_used(source)
@@ -349,7 +351,7 @@ class _Run:
         if not masks.is_dir() or not maps.is_dir():
             return metrics
         try:
-            found = score_folder(maps, masks).to_dict()
+            found = score_folder(maps, masks, source=masks.parent).to_dict()
             if self.config.input.masks:
                 found["notes"] += [told_what_moves(self.config.input.masks)]
             return {**(metrics or {}), "masks": found}

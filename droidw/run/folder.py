@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from droidw.errors import UsageError
 
-__all__ = ["FILES", "finish", "listed", "prepare"]
+__all__ = ["FILES", "RunFolder", "listed", "prepare"]
 
 FILES: Mapping[str, str] = {
     "trajectory.tum": "pose of every input frame: t tx ty tz qx qy qz qw, camera to world",
@@ -28,20 +28,63 @@ FILES: Mapping[str, str] = {
 """What a run leaves, by name within the run folder."""
 
 _WITHIN = ("depth/full",)
-_EARLIER = ".earlier"
-"""Folder in the run folder, of what an earlier run left there, until a new one has something."""
+_AT_ONCE = ("config.yaml", "log.txt")
 
 
-def prepare(run_dir: Path, overwrite: bool, inputs: Mapping[str, str] | None = None) -> bool:
-    """Make the folder, or set aside what an earlier run left there.
+@dataclass
+class RunFolder:
+    """The folder of a run that begins.
 
-    Only files of an earlier run are ever touched, and only with `overwrite`; `finish` deletes them.
+    What an earlier run left there stays as it was until this one has something to keep: what it
+    writes before that goes to hidden files beside it.
+
+    Attributes:
+        path: the folder. fresh: whether it was not there before.
+        replaces: whether it holds an earlier run.
+    """
+
+    path: Path
+    fresh: bool
+    replaces: bool
+
+    def early(self, name: str) -> Path:
+        """Where a file of this name goes before there is anything to keep."""
+        return self.path / (f".{name}.{os.getpid()}" if self.replaces else name)
+
+    def begin(self) -> None:
+        """Delete what an earlier run left, as this one has something to keep.
+
+        Only files that a run writes go, and the folders that are empty then.
+        """
+        if not self.replaces:
+            return
+        for path in _files(self.path):
+            path.unlink()
+        for name in (*_WITHIN, *FILES):
+            if (self.path / name).is_dir() and not any((self.path / name).iterdir()):
+                (self.path / name).rmdir()
+        for name in _AT_ONCE:
+            if self.early(name).exists():
+                self.early(name).rename(self.path / name)
+            for left in self.path.glob(f".{name}.*"):  # of runs that were killed
+                left.unlink()
+        self.replaces = False
+
+    def finish(self) -> None:
+        """Take back what a run wrote that ended before it had anything to keep."""
+        if self.replaces or {path.name for path in _files(self.path)} <= {*_AT_ONCE}:
+            for name in _AT_ONCE:
+                self.early(name).unlink(missing_ok=True)
+            if self.fresh and not any(self.path.iterdir()):
+                self.path.rmdir()
+
+
+def prepare(run_dir: Path, overwrite: bool, inputs: Mapping[str, str] | None = None) -> RunFolder:
+    """Make the folder of a run.
 
     Args:
         run_dir: the folder. overwrite: whether it may hold an earlier run.
         inputs: key -> path of what this run reads, which must not be replaced.
-    Returns:
-        Whether the folder was not there before.
     Raises:
         UsageError: the folder holds something, or cannot be written, or is read from.
     """
@@ -65,7 +108,7 @@ def prepare(run_dir: Path, overwrite: bool, inputs: Mapping[str, str] | None = N
             "give a folder that you may write to: -o FOLDER",
         )
     if not held:
-        return fresh
+        return RunFolder(run_dir, fresh, replaces=False)
     shown = ", ".join(held[:4]) + (", ..." if len(held) > 4 else "")
     if not overwrite:
         raise UsageError(
@@ -84,28 +127,7 @@ def prepare(run_dir: Path, overwrite: bool, inputs: Mapping[str, str] | None = N
                 "what an earlier run left",
                 "copy it to another place first, or give another folder: -o FOLDER",
             )
-    finish(run_dir, fresh=False)  # of a run that was killed
-    _move(run_dir, run_dir / _EARLIER)
-    return fresh
-
-
-def finish(run_dir: Path, fresh: bool) -> None:
-    """Delete what an earlier run left, if this one has something to keep; else leave no trace.
-
-    A run that is refused before it has tracked anything takes back its folder, or leaves the
-    earlier run as it was.
-
-    Args:
-        run_dir: as prepared. fresh: what `prepare` said.
-    """
-    earlier, own = run_dir / _EARLIER, _files(run_dir)
-    if {path.name for path in own} <= {"config.yaml", "log.txt"}:
-        for path in own:
-            path.unlink()
-        _move(earlier, run_dir)
-        if fresh and not any(run_dir.iterdir()):
-            run_dir.rmdir()
-    shutil.rmtree(earlier, ignore_errors=True)
+    return RunFolder(run_dir, fresh, replaces=True)
 
 
 def listed(run_dir: Path, later: Collection[str]) -> dict[str, str]:
@@ -127,11 +149,3 @@ def _files(run_dir: Path) -> list[Path]:
             if entry.is_symlink() or entry.is_file():
                 found.append(entry)
     return found
-
-
-def _move(source: Path, target: Path) -> None:
-    """Move the files of a run, each to its place in another folder."""
-    for path in _files(source):
-        place = target / path.relative_to(source)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        path.replace(place)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 __all__ = ["could_not_be_used", "open_source"]
 
+# As `droidw.io.notes` says it: rows of a truth are skipped, too.
+_LEFT_OUT = re.compile(r", skipped$|^\d+ more (pictures|bad lines) .*skipped$")
 _log = logging.getLogger("droidw.run.drive")
 
 
@@ -75,7 +78,7 @@ def could_not_be_used(source: FrameSource) -> list[str]:
     """Sentences about pictures of the source that were left out, and what else is to be known."""
     if not source.skipped:
         return source.problems[:5]
-    left_out = [text for text in source.problems if text.endswith("skipped")]
+    left_out = [text for text in source.problems if _LEFT_OUT.search(text)]
     others = [text for text in source.problems if text not in left_out][:5]
     what = "picture" if source.skipped == 1 else "pictures"
     why = f": {'; '.join(left_out[:3])}" if left_out else ""

@@ -157,6 +157,7 @@ def test_names_of_sequences_stay_apart(tmp_path):
     assert [Path(f.source).name for f in found.values()] == [n.split("/")[-1] for n in names]
     assert list(found)[:2] == ["my-clip", next(k for k in found if k.startswith("my-clip-"))]
     assert all(name[0].isalnum() and "/" not in name for name in found)
+    assert list(load_plan(str(file), tmp_path, ["a", "b", "a"]).sequences) == ["a", "b"]
 
 
 @pytest.mark.parametrize(

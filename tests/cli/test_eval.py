@@ -161,6 +161,19 @@ def test_a_run_that_was_told_what_moves(
         assert any("the run was told what moves" in note for note in notes) == told
 
 
+def test_a_folder_called_as_a_sequence_is_not_the_source(
+    places: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from droidw.eval.summary import source_of
+
+    run, source = places
+    monkeypatch.chdir(source.parent)
+    for text, known in ((f"bonn:{source.name}", None), (f"tum:{source}", source)):
+        (run / "config.yaml").write_text(f"input: {{source: '{text}'}}\n")
+        (run / "manifest.json").unlink(missing_ok=True)
+        assert source_of(run) == known
+
+
 def test_masks_that_a_run_found_are_no_truth(
     places: tuple[Path, Path], capsys: pytest.CaptureFixture
 ) -> None:

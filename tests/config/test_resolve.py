@@ -80,7 +80,7 @@ PHASES = ", ".join(DroidwConfig().schedule)
          "--calib FILE, --focal PIXELS, --fov DEGREES; one that a file sets is off with "
          "camera.calib=null"),
         ("camera.size=[3]",
-         "camera.size: [3] is not a working size\n  valid: [width, height], each at least 16, "
+         "camera.size: [3] is not a working size\n  valid: [width, height], each at least 32, "
          "or [] to follow camera.long_side"),
         ("camera=3",
          "camera: 3 is not valid here\n  expected a section with keys: calib, focal, fov, "
@@ -185,6 +185,11 @@ def test_parts_without_a_common_device(resolved):
         "correspondence.name: 'flow' runs only on cpu, where not all other parts do"
     )
     assert resolved("ba=cuda", "correspondence=net").devices == {"cuda"}
+
+
+def test_a_seed_has_a_largest_value(resolved):
+    with pytest.raises(ConfigError, match="seed: 99999999999 is out of range"):
+        resolved("seed=99999999999")
 
 
 def test_options_of_a_type_that_yaml_cannot_hold(resolved):

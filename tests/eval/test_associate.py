@@ -100,6 +100,11 @@ def test_frame_indices_of_more_frames_than_were_tracked() -> None:
         associate(np.arange(80) / 30, np.arange(1000.0), minimum=3)
 
 
+def test_a_short_clip_beside_truth_once_a_second() -> None:
+    """Few pairs, but truth does not last a hundred times as long."""
+    assert len(associate(np.arange(150) / 30, np.arange(61.0), minimum=3).est) == 5
+
+
 @pytest.mark.parametrize("est", [[0.0, 0.1], [0.1, 0.1, 0.1, 0.1]])
 def test_too_few_poses_are_no_matter_of_clocks(est: list[float]) -> None:
     with pytest.raises(InputError, match="the estimate has fewer") as caught:

@@ -131,6 +131,7 @@ def test_a_calibration_for_another_size_is_scaled_with_its_half_pixel_and_said_s
         ("c.txt", "", "holds no calibration"),
         ("c.txt", "hello\n", "fx fy cx cy not found"),
         ("c.yaml", "width: 640\n", "no list under the key 'calibration'"),
+        ("c.yaml", "500\n", "not valid YAML"),
         ("c.yaml", "width: [640\nheight: 480\n", "line 2: not valid YAML"),
         ("c.yaml", "width: 640\nheight: 480\ncalibration: [1, 2, x, 4]\n", "line 3: 'x' is not"),
         ("c.yaml", "calibration: [500, 500, -9, 240]\n", "line 1: the principal point"),

@@ -6,8 +6,9 @@ import math
 
 import pytest
 
-from droidw.io.listing import in_folder, longest_rising, read_listing
+from droidw.io.listing import in_folder, read_listing
 from droidw.io.notes import Notes
+from droidw.io.rising import longest_rising, rising
 
 
 @pytest.mark.parametrize(
@@ -20,6 +21,7 @@ from droidw.io.notes import Notes
         ("1.5 rgb/two words.png", "two words.png"),
         ("1.5 rgb/a.png # remark", "a.png"),
         ("  1.5 rgb/a.png  ", "a.png"),
+        ("1.5, rgb/a.png,", "a.png"),
     ],
 )
 def test_names_hold_what_files_may_be_called(tmp_path, line, name):
@@ -39,12 +41,21 @@ def test_names_hold_what_files_may_be_called(tmp_path, line, name):
         ([1, 2, 99, 3, 4], [0, 1, 3, 4]),
         ([5, 5, 6], [0, 2]),
         ([3, 2, 1], [2]),
+        ([0, 2, 1, 3], [0, 2, 3]),
     ],
 )
 def test_one_stray_value_costs_no_other(values, kept):
     found = longest_rising(values)
     assert [values[i] for i in found] == [values[i] for i in kept]
     assert found == sorted(found)
+
+
+@pytest.mark.parametrize(
+    ("values", "kept"),
+    [([], []), ([0, 2, 1, 3], [0, 1, 3]), ([1, 2, 99, 3, 4], [0, 1, 3, 4]), ([3, 2], [0])],
+)
+def test_what_runs_backwards_is_left_out(values, kept):
+    assert rising(values) == kept
 
 
 def test_pictures_without_times_have_none(tmp_path):

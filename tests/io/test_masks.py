@@ -182,6 +182,20 @@ def test_a_mask_of_a_raw_picture_is_undistorted_though_nothing_is_resized():
         rectify.rectify_mask(working.T, working=True)
 
 
+@pytest.mark.parametrize("long_side", [320, 512, 640])
+@pytest.mark.parametrize("of", [320, 512, 640])
+def test_masks_of_a_run_at_another_size(long_side, of):
+    """320x180 is cropped to 320x176, 512x288 is not: what they show lies at the same place."""
+    camera = Camera(1920, 1080, 1500.0, 1500.0, 959.5, 539.5)
+    raw = np.zeros((1080, 1920), bool)
+    raw[300:800, 500:1500] = True
+    expected = Rectifier(camera, long_side=long_side).rectify_mask(raw)
+    made = Rectifier(camera, long_side=of).rectify_mask(raw)
+    laid = Rectifier(camera, long_side=long_side).rectify_mask(made, working=True)
+    assert laid.shape == expected.shape
+    assert (laid != expected).sum() <= 0.04 * expected.sum()
+
+
 def test_masks_that_droidw_wrote_show_its_working_pictures(folder):
     place = folder({"000000.png": 3})
     assert not UserMasks(place).working

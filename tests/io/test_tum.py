@@ -140,3 +140,18 @@ def test_files_that_are_no_text_or_not_there(tmp_path):
     ):
         with pytest.raises(InputError, match=words):
             read_tum(path)
+
+
+def test_one_stray_time_costs_no_other_row(tmp_path):
+    rows = [f"{t / 10} {t} 0 0 0 0 0 1" for t in range(300)]
+    rows.insert(5, "99999 0 0 0 0 0 0 1")
+    rows.insert(50, rows[49])
+    file = tmp_path / "truth.tum"
+    file.write_text("\n".join(rows) + "\n")
+    problems: list[str] = []
+    assert len(read_tum(file, problems=problems)) == 300
+    assert len(problems) == 2
+    assert "line 6: time stamp 99999.0 lies ahead of the rows after it" in problems[0]
+    assert "repeats" in problems[1]
+    with pytest.raises(InputError, match=r"line 7: time stamp 0\.5 runs backwards from 99999"):
+        read_tum(file)

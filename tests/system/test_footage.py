@@ -119,6 +119,7 @@ def test_one_unusable_picture_is_told_apart_from_other_things(go, footage):
     clip = footage(count=12)
     (clip.folder / "rgb.txt").unlink()
     (clip.folder / "rgb" / "0007.png").write_bytes(b"\x89PNG and then nothing")
+    (clip.folder / "groundtruth.txt").write_text("0 0 0 0 0 0 0 1\n1 0 0 nan 0 0 0 1\n")
     ran = go(clip.folder)
     assert ran.code == 0, ran.err
     said = ran.manifest["warnings"]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from droidw.run.folder import finish, prepare
+from droidw.run.folder import prepare
 
 RAISING = """
 import droidw
@@ -140,7 +140,7 @@ def test_a_refused_run_leaves_the_earlier_one_as_it_was(go, footage, tmp_path):
     assert done.code == 0, done.err
     files = contents(first.folder)
     assert len(done.poses) == 3 and len(files) < len(kept)
-    assert not [path for path in files if ".earlier" in path.parts or "full" in path.parts]
+    assert not [path for path in files if path.name.startswith(".") or "full" in path.parts]
     assert files[Path("depth/mine/notes.txt")] == b"mine"
 
 
@@ -155,16 +155,27 @@ def test_what_a_run_reads_is_never_replaced(go, footage):
         assert contents(first.folder) == kept
 
 
-def test_a_killed_run_gives_back_what_it_had_set_aside(tmp_path):
-    """Killed before it had anything to keep, and the next one is refused as well."""
-    (tmp_path / "trajectory.tum").write_text("poses")
-    (tmp_path / "config.yaml").write_text("of the first")
-    assert prepare(tmp_path, overwrite=True) is False
-    (tmp_path / "config.yaml").write_text("of the killed one")
-    assert prepare(tmp_path, overwrite=True) is False
-    finish(tmp_path, fresh=False)
-    files = {path.name: text for path, text in contents(tmp_path).items()}
-    assert files == {"trajectory.tum": b"poses", "config.yaml": b"of the first"}
+def test_until_it_has_something_to_keep_a_run_replaces_nothing(tmp_path):
+    """Killed before that, it leaves an earlier run whole; afterwards nothing of that is left."""
+    earlier = {Path("trajectory.tum"): b"poses", Path("config.yaml"): b"of the first"}
+    earlier |= {Path("depth/full/000000.png"): b"deep", Path("masks/000000.png"): b"dark"}
+    for path, data in earlier.items():
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_bytes(data)
+    folder = prepare(tmp_path, overwrite=True)
+    folder.early("config.yaml").write_text("of the second")
+    found = contents(tmp_path)
+    assert {path: found[path] for path in earlier} == earlier
+    folder.finish()
+    assert contents(tmp_path) == earlier
+    folder = prepare(tmp_path, overwrite=True)
+    folder.early("config.yaml").write_text("of the third")
+    folder.begin()
+    (tmp_path / "trajectory.tum").write_text("other poses")
+    folder.finish()
+    left = {Path("config.yaml"): b"of the third", Path("trajectory.tum"): b"other poses"}
+    assert contents(tmp_path) == left
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.yaml", "trajectory.tum"]
 
 
 def test_overwrite_spares_what_is_no_run(go, footage, tmp_path):

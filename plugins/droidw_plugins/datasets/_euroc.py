@@ -128,7 +128,8 @@ def _truth(path: Path, sensor: dict[str, Any], problems: list[str]) -> Trajector
     """Poses of the camera: those of the body, and T_BS of the camera in it."""
     if not path.is_file():
         return None
-    mounted = _numbers((sensor.get("T_BS") or {}).get("data"), 16)
+    said = sensor.get("T_BS")
+    mounted = _numbers(said.get("data") if isinstance(said, dict) else None, 16)
     if not mounted:
         problems.append("sensor.yaml has no T_BS, so the truth of the body is not used")
         return None

@@ -118,7 +118,7 @@ def _projection(path: Path, camera: int, problems: list[str]) -> _Rows | None:
             P = np.array(values, dtype=np.float64).reshape(3, 4)
         except ValueError:
             P = np.zeros((3, 4))
-        if np.isfinite(P).all() and P[0, 0] > 0 and P[1, 1] > 0:
+        if np.isfinite(P).all() and P[0, 0] > 0 and P[1, 1] > 0 and P[2, 2] != 0:
             return P
     problems.append(f"{path.name} has no usable P{camera}; the camera is unknown")
     return None

@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from droidw.errors import InputError
 from droidw.io.files import read_text
-from droidw.io.listing import Entry, longest_rising
+from droidw.io.listing import Entry
+from droidw.io.rising import rising
 from droidw.io.tum import read_tum
 from droidw.slam.frame import Trajectory
 
@@ -50,7 +51,7 @@ def read_positions(path: Path, problems: list[str]) -> Trajectory | None:
         problems.append(f"{path.name} has a row that is no numbers; the run is not scored")
         return None
     values = values[np.isfinite(values).all(1)]
-    values = values[longest_rising(values[:, 0].tolist())]  # one stray time costs no other
+    values = values[rising(values[:, 0].tolist())]  # one stray time costs no other
     if not len(values):
         problems.append(f"{path.name} holds no position; the run is not scored")
         return None

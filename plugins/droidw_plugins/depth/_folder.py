@@ -202,7 +202,7 @@ def _read_list(listing: Path) -> tuple[list[float], list[Path]]:
     """Times (ascending) and files of a depth.txt; '#' starts a comment."""
     entries: list[tuple[float, Path]] = []
     for number, line in enumerate(listing.read_text(errors="replace").splitlines(), start=1):
-        parts = line.split("#", 1)[0].split(maxsplit=1)
+        parts = re.split(r"(?:^|\s)#", line, maxsplit=1)[0].split(maxsplit=1)
         if not parts:
             continue
         time = math.nan
