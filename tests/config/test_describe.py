@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,24 @@ def test_every_key_is_explained():
     described = list(rows(DroidwConfig))
     assert [row.key for row in described if not row.help] == []
     assert len({row.key for row in described}) == len(described)
+
+
+@dataclasses.dataclass(frozen=True)
+class Odd:
+    """Options of a plugin, of types that only a string stands for in YAML."""
+
+    model: Path = Path("a/b.pt")
+    choice: Choice = dataclasses.field(default_factory=lambda: Choice.FAST)
+
+
+class Choice(enum.Enum):
+    """A choice of a plugin."""
+
+    FAST = 1
+
+
+def test_options_of_other_types_are_described():
+    assert [row.default for row in rows(Odd)] == ["a/b.pt", "FAST"]
 
 
 def test_rows_say_type_default_and_limits():

@@ -49,7 +49,14 @@ def test_damaged_rows_cost_themselves_alone(reader, trees, data):
 
 
 @pytest.mark.parametrize(
-    "sensor", ["", "a: [", "intrinsics: [1, 2]\nT_BS: {data: [1]}", "intrinsics: [1, 1, 1, .nan]"]
+    "sensor",
+    [
+        "",
+        "a: [",
+        "intrinsics: [1, 2]\nT_BS: {data: [1]}",
+        "T_BS: [1, 0]",
+        "intrinsics: [1, 1, 1, .nan]",
+    ],
 )
 def test_an_unusable_calibration_is_told(reader, trees, data, sensor):
     mav = trees.euroc(data / "EuRoC" / "V1_01_easy") / "mav0"

@@ -47,6 +47,8 @@ def test_gaps_bad_rows_and_missing_files(reader, trees, data):
     np.testing.assert_allclose([f.time for f in frames], [0.0, 0.1, 0.3, 0.4])
     np.testing.assert_allclose(source.truth.centres[:, 2], [0, 1])
     assert source.skipped == 1 and any("2 bad rows" in text for text in source.problems)
+    (folder / "calib.txt").write_text("P2: 1 0 0 0 0 1 0 0 0 0 0 0\n")
+    assert reader.open(str(folder), Selection()).camera is None
     (folder / "calib.txt").write_text("P2: 1 2 3\n")
     assert reader.open(str(folder), Selection()).camera is None
     (data / "KITTI" / "poses" / "05.txt").unlink()

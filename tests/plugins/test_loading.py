@@ -263,6 +263,7 @@ def test_register_from_python(monkeypatch):
         (component("Not Kebab"), "the name 'Not Kebab' is not lower-case kebab"),
         (component(options=dict), "options is a type"),
         (component(requires="torch"), "requires is 'torch', not a collection"),
+        (component(requires=None), "requires is None, not a collection"),
         (droidw.Component("mine", "", None), "factory is nothing"),
         (42, "yielded a int"),
     ],
