@@ -129,7 +129,7 @@ class Dispatcher:
             name, observer = entry
             try:
                 observer.on_event(event)
-            except Exception as error:  # noqa: BLE001 - observers are strangers' code
+            except (Exception, SystemExit) as error:  # noqa: BLE001 - observers are strangers' code
                 self._observers.remove(entry)
                 _log.debug("observer %s raised", name, exc_info=True)
                 self.warn(

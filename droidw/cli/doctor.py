@@ -129,18 +129,24 @@ def _folders(found: Diagnosis, plugins: Plugins) -> None:
     weights = plugins.weights_dir
     files = sorted(p.name for p in weights.iterdir() if p.is_file()) if weights.is_dir() else []
     data = data_root()
-    cache = weights.parent
+    above = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    cache = Path(os.environ.get("DROIDW_CACHE") or Path(above) / "droidw").expanduser()
+    known = ", ".join(files) or "empty" if weights.is_dir() else "not there"
     found.facts["folders"] = {
-        "weights": f"{weights} ({', '.join(files) if files else 'empty'})",
+        "weights": f"{weights} ({known})",
         "data": f"{data} ({'there' if data.is_dir() else 'not there'})",
         "cache": f"{cache} ({'writable' if _writable(cache) else 'not writable'})",
         "here": f"{Path.cwd()} ({'writable' if _writable(Path.cwd()) else 'not writable'})",
     }
-    if not _writable(cache):
-        found.notes.append(
-            f"{cache} cannot be written: weights and compiled kernels cannot be kept there; "
-            "name another folder: export XDG_CACHE_HOME=FOLDER"
-        )
+    for folder, what, variable in (
+        (cache, "compiled kernels", "DROIDW_CACHE"),
+        (weights.parent, "weights", "DROIDW_WEIGHTS"),
+    ):
+        if not _writable(folder):
+            found.notes.append(
+                f"{folder} cannot be written: {what} cannot be kept there; "
+                f"name another folder: export {variable}=FOLDER"
+            )
 
 
 def _plugin_status(found: Diagnosis, plugins: Plugins) -> None:

@@ -37,7 +37,7 @@ LISTED = ("exporters", "observers")
 YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """Written in C where PyYAML has it: an ablation reads its files once for every row."""
 
-_COMMAND_LINE = "command line"
+COMMAND_LINE = "command line"
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)")
 _Tree = dict[str, Any]
 
@@ -137,7 +137,7 @@ def override_layers(
         UsageError: an override is not `key=value`.
     """
     said = [*trees, *(_nested(*_override(text)) for text in overrides)]
-    return [(_COMMAND_LINE, tree) for tree in sorted(said, key=lambda tree: not _chooses(tree))]
+    return [(COMMAND_LINE, tree) for tree in sorted(said, key=lambda tree: not _chooses(tree))]
 
 
 # A date that is none, a tag that nobody knows, an alias of what it is part of.
@@ -266,15 +266,15 @@ def _override(text: str) -> tuple[list[str], Any]:
     path = key.strip().split(".")
     if not equals or not all(path):
         raise UsageError(
-            f"{_COMMAND_LINE}: '{text}' is not key=value",
+            f"{COMMAND_LINE}: '{text}' is not key=value",
             "example: camera.long_side=512   or   uncertainty=none",
         )
     try:
         node = yaml.compose(value, Loader=YAML_LOADER)
-        found = None if node is None else _Builder(_COMMAND_LINE).value(node, "")
+        found = None if node is None else _Builder(COMMAND_LINE).value(node, "")
     except _NO_VALUE as error:
         raise UsageError(
-            f"{_COMMAND_LINE}: {key}: the value {value!r} is not YAML: "
+            f"{COMMAND_LINE}: {key}: the value {value!r} is not YAML: "
             + " ".join(str(error).split()),
             "quote it for the shell and for YAML, for example: 'input.source=\"a: b\"'",
         ) from error

@@ -15,7 +15,7 @@ import yaml
 
 from droidw.config.check import check_keys, check_ranges, typed
 from droidw.config.inert import check_inert
-from droidw.config.load import LISTED, LoadedConfig, Source, load_config
+from droidw.config.load import COMMAND_LINE, LISTED, LoadedConfig, Source, load_config
 from droidw.config.packaged import packaged_in
 from droidw.config.plain import plain
 from droidw.config.schema import DroidwConfig
@@ -26,7 +26,6 @@ from droidw.errors import (
     PluginError,
     did_you_mean,
 )
-from droidw.geometry.sizes import SMALLEST
 from droidw.plugin.component import Component
 from droidw.plugin.manager import Plugins
 from droidw.plugin.registry import FETCH, SLOTS, Entry, PluginNotFound
@@ -261,18 +260,20 @@ def _joined(problems: Sequence[DroidwError], loaded: LoadedConfig) -> DroidwErro
 def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
     """What types and ranges of single keys cannot say."""
     size = config.camera.size
-    if size and (len(size) != 2 or min(size) < SMALLEST):
+    if size and (len(size) != 2 or min(size) < 16):
         raise ConfigError(
             f"{loaded.at('camera.size')}: {size} is not a working size",
-            f"valid: [width, height], each at least {SMALLEST}, or [] to follow camera.long_side",
+            "valid: [width, height], each at least 16, or [] to follow camera.long_side",
         )
     said = [key for key in ("calib", "focal", "fov") if getattr(config.camera, key) is not None]
     if len(said) > 1:
+        typed_in = [key for key in said if loaded.at(f"camera.{key}").startswith(COMMAND_LINE)]
+        old = next((key for key in said if key not in typed_in), said[0])
         raise ConfigError(
             f"{loaded.at('camera.' + said[-1])}: {' and '.join(said)} are given, but only one of "
             "them can hold",
             "give one of --calib FILE, --focal PIXELS, --fov DEGREES; one that a file sets is off "
-            f"with camera.{said[0]}=null",
+            f"with camera.{old}=null",
         )
     phases = list(DroidwConfig().schedule)
     for phase in config.schedule:
@@ -305,7 +306,8 @@ def _check_fit(
             f"{loaded.at('uncertainty.name')}: '{model.name}' needs features, and the feature "
             f"extractor '{extractor.name}' gives none",
             "choose another extractor (features=NAME), or run without uncertainty: "
-            "uncertainty=none",
+            "uncertainty=none; a plugin says that it gives some by "
+            "capabilities={'cpu', 'features'} in its Component",
         )
     devices = frozenset({"cpu", "cuda"})
     wanted = config.device.partition(":")[0]

@@ -75,7 +75,14 @@ def read_calibration(path: Path | str, width: int, height: int) -> tuple[Camera,
         camera, where = _from_droid(path, lines, width, height)
     else:
         camera, where = _from_keys(path, lines, width, height)
-    return _fit(_centred(camera.validated(where), where), width, height, where)
+    camera, note = _fit(_centred(camera.validated(where), where), width, height, where)
+    if not (0.2 < camera.cx / width < 0.8 and 0.2 < camera.cy / height < 0.8):
+        _log.warning(
+            "%s: its principal point (%g, %g) lies far from the middle of pictures of %dx%d "
+            "pixels: is it for another size? then say width and height in it",
+            where, camera.cx, camera.cy, width, height,
+        )  # fmt: skip
+    return camera, note
 
 
 def _centred(camera: Camera, where: str) -> Camera:

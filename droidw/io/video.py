@@ -252,5 +252,7 @@ def _promised_end(container: InputContainer, stream: VideoStream) -> float | Non
         return _start(stream) + float(stream.duration * _time_base(stream))
     # The duration of the whole may be that of a longer sound track.
     if container.duration and len(container.streams) == 1:
+        if "matroska" in container.format.name:  # which counts from 0, wherever it begins
+            return container.duration / av.time_base
         return (container.start_time or 0) / av.time_base + container.duration / av.time_base
     return None

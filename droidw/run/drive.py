@@ -321,7 +321,7 @@ class _Run:
             for done, (component, options) in enumerate(self.resolved.exporters):
                 try:
                     component.factory(options, self.context).export(result, self.run_dir)
-                except Exception as error:  # noqa: BLE001 - one exporter must not cost the others
+                except (Exception, SystemExit) as error:  # noqa: BLE001 - it must not cost others
                     _log.debug("exporter %s raised", component.name, exc_info=True)
                     kind = "" if isinstance(error, DroidwError) else f"{type(error).__name__}: "
                     self.events.warn(f"exporter '{component.name}' failed: {kind}{error}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import threading
 from collections.abc import Iterable, Iterator
@@ -9,6 +10,8 @@ from types import FrameType, TracebackType
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
 
 __all__ = ["Stop"]
 
@@ -41,6 +44,7 @@ class Stop:
         """The items that come before a signal does."""
         for item in items:
             if self.signum:
+                _log.warning("stopping: what was tracked is written; once more: stop at once")
                 return
             yield item
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from droidw.geometry.transfer import upload
 from droidw.interfaces.features import KnowsMovable
+from droidw.slam.contract import depth_of, features_of
 from droidw.solve.weights import unmasked
 
 if TYPE_CHECKING:
@@ -45,7 +46,8 @@ class CellMaps:
     def features(self, frame: Frame) -> Tensor:
         """[C,h,w] of the extractor."""
         with self._clock("features"):
-            return self.parts.features.extract(upload(frame.image, self._device), self._picked)
+            extractor, image = self.parts.features, upload(frame.image, self._device)
+            return features_of(extractor.extract(image, self._picked), extractor.dim, self._picked)
 
     def movable(self, frame: Frame) -> Tensor | None:
         """[h,w] in [0,1], how much speaks for what can move; None where nobody knows."""
@@ -60,10 +62,10 @@ class CellMaps:
         """[h,w] inverse depth, 0 where it is not known."""
         with self._clock("depth prior"):
             blank = torch.zeros(self._grid.height, self._grid.width, device=self._device)
-            prediction = self.parts.depth.predict(frame)
-            if prediction is None:
+            predicted = depth_of(self.parts.depth.predict(frame), *frame.image.shape[1:])
+            if predicted is None:
                 return blank
-            depth = self._picked.sample(upload(prediction.depth, self._device), mode="nearest")
+            depth = self._picked.sample(upload(predicted, self._device), mode="nearest")
             known = torch.isfinite(depth) & (depth > 0)
             return torch.where(known, 1.0 / depth.clamp_min(1e-6), blank)
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from droidw.geometry.interpolate import interpolate
-from droidw.geometry.se3 import exp, inv, log, mul
+from droidw.geometry.se3 import exp, identity, inv, log, mul
 from droidw.slam.frame import Trajectory
 from droidw.slam.locate import locate
 from droidw.slam.smoothing import smoothed
@@ -54,6 +54,8 @@ class Filler:
     def start(self, time: float) -> Tensor:
         """Interpolated pose [7] at `time`; held motion beyond the last keyframe."""
         T_cw = self.optimiser.store.T_cw
+        if not self._times:  # tracking failed before the first one
+            return identity(dtype=T_cw.dtype, device=T_cw.device)
         before, after = self.neighbours(time)
         if before != after:
             share = (time - self._times[before]) / (self._times[after] - self._times[before])

@@ -311,7 +311,7 @@ class SlamSystem:
             grid=self.grid,
             focal=self.focal,
             last_index=self.last_index,
-            metric=self.parts.depth.metric,
+            metric=self.parts.depth.metric and bool((self.store["prior"] > 0).any()),
             reports={**self.optimiser.reports, **unusable(self.store)},
         )
 

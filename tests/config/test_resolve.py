@@ -80,7 +80,7 @@ PHASES = ", ".join(DroidwConfig().schedule)
          "--calib FILE, --focal PIXELS, --fov DEGREES; one that a file sets is off with "
          "camera.calib=null"),
         ("camera.size=[3]",
-         "camera.size: [3] is not a working size\n  valid: [width, height], each at least 32, "
+         "camera.size: [3] is not a working size\n  valid: [width, height], each at least 16, "
          "or [] to follow camera.long_side"),
         ("camera=3",
          "camera: 3 is not valid here\n  expected a section with keys: calib, focal, fov, "
@@ -173,7 +173,8 @@ def test_model_that_needs_features(resolved):
     assert str(caught.value) == (
         "uncertainty.name: 'affine-softplus' needs features, and the feature extractor 'none' "
         "gives none\n  choose another extractor (features=NAME), or run without uncertainty: "
-        "uncertainty=none"
+        "uncertainty=none; a plugin says that it gives some by capabilities={'cpu', 'features'} in "
+        "its Component"
     )
     assert resolved("features=none", "uncertainty=none").parts["features"][0].name == "none"
 
@@ -185,6 +186,14 @@ def test_parts_without_a_common_device(resolved):
         "correspondence.name: 'flow' runs only on cpu, where not all other parts do"
     )
     assert resolved("ba=cuda", "correspondence=net").devices == {"cuda"}
+
+
+def test_the_advice_is_to_switch_off_what_the_file_says(plugins, tmp_path):
+    (tmp_path / "mine.yaml").write_text("camera: {fov: 60}\n")
+    loaded = load_config([tmp_path / "mine.yaml"], "cpu", ["camera.focal=300"])
+    with pytest.raises(ConfigError, match="focal and fov are given") as caught:
+        resolve(loaded, plugins)
+    assert caught.value.hint.endswith("with camera.fov=null")
 
 
 def test_a_seed_has_a_largest_value(resolved):

@@ -154,3 +154,10 @@ def test_files_that_are_not_there(tmp_path):
         read_calibration(tmp_path / "c.txt", 640, 480)
     with pytest.raises(InputError, match="is a folder"):
         read_calibration(tmp_path, 640, 480)
+
+
+@pytest.mark.parametrize(("centre", "far"), [("319.5 239.5", True), ("159.5 119.5", False)])
+def test_a_calibration_of_twice_the_size_is_told_of(tmp_path, caplog, centre, far):
+    (tmp_path / "c.txt").write_text(f"400 400 {centre} -0.1 0.01 0 0\n")
+    read_calibration(tmp_path / "c.txt", 320, 240)
+    assert any("lies far from the middle" in r.getMessage() for r in caplog.records) == far

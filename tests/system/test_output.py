@@ -294,3 +294,82 @@ def test_a_part_that_breaks_its_contract_is_named(go, footage, plugin, code, sai
     ran = go(footage(count=14).folder, "--plugin", plugin(code), "uncertainty=odd")
     assert ran.code == 5
     assert said in ran.err and "bug of droidw" not in ran.err
+
+
+SHAPES = """
+import numpy as np, torch, droidw
+from droidw.interfaces.depth import DepthMap
+
+class Mine:
+    dim = 4
+    metric = True
+    def extract(self, image, grid):
+        return {features}
+    def predict(self, frame):
+        h, w = frame.image.shape[1:]
+        return {depth}
+
+READY = frozenset({{"cpu", "features", "depth"}})
+
+@droidw.hookimpl
+def droidw_feature_extractors():
+    yield droidw.Component("mine", "of a stranger", lambda o, c: Mine(), capabilities=READY)
+
+@droidw.hookimpl
+def droidw_depth_priors():
+    yield droidw.Component("mine", "of a stranger", lambda o, c: Mine(), capabilities=READY)
+"""
+
+
+@pytest.mark.parametrize(
+    ("slot", "features", "depth", "said"),
+    [
+        (
+            "features",
+            "torch.zeros(4, 3, 3)",
+            "None",
+            "`extract` returned a tensor [4, 3, 3], not a",
+        ),
+        ("features", "torch.zeros(5, grid.height, grid.width)", "None", "tensor [5, 15, 20], not"),
+        (
+            "features",
+            "np.zeros((4, grid.height, grid.width))",
+            "None",
+            "returned ndarray [4, 15, 20]",
+        ),
+        (
+            "depth",
+            "None",
+            "torch.ones(h, w)",
+            "`predict` returned a tensor [120, 160], not a DepthMap",
+        ),
+        ("depth", "None", "DepthMap(torch.ones(3, w))", "returned a DepthMap of a tensor [3, 160]"),
+    ],
+)
+def test_maps_of_the_wrong_shape_are_told(go, footage, plugin, slot, features, depth, said):
+    file = plugin(SHAPES.format(features=features, depth=depth))
+    ran = go(footage(count=8).folder, "--plugin", file, f"{slot}=mine")
+    assert ran.code == 5, ran.err
+    assert said in ran.err and "bug of droidw" not in ran.err
+
+
+@pytest.mark.parametrize("depth", ["None", "DepthMap(torch.full((h, w), float('nan')))"])
+def test_a_prior_that_gives_no_depth_makes_nothing_metric(go, footage, plugin, depth):
+    file = plugin(SHAPES.format(features="None", depth=depth))
+    ran = go(footage(count=14).folder, "--plugin", file, "depth=mine")
+    assert ran.code == 0, ran.err
+    assert ran.manifest["scale"] == "arbitrary"
+
+
+EXITS = RAISING.replace("raise RuntimeError(", "raise SystemExit(").replace(
+    "raise ValueError", "raise SystemExit"
+)
+
+
+def test_parts_that_leave_end_no_run(go, footage, plugin):
+    more = ("observers.deaf={}", "exporters.aa-clumsy={}")
+    ran = go(footage(count=8).folder, "--plugin", plugin(EXITS), *more)
+    assert ran.code == 0, ran.err
+    assert len(ran.poses) == 8 and ran.manifest["frames"] == 8
+    assert "observer 'deaf' raised SystemExit" in ran.warnings
+    assert "exporter 'aa-clumsy' failed: SystemExit" in ran.warnings
