@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from droidw.io.masks import UserMasks
     from droidw.plugin.manager import Plugins
     from droidw.slam.frame import Frame, RawFrame
+    from droidw.slam.optimise import Parts
 
 __all__ = ["run"]
 
@@ -163,7 +164,7 @@ class _Run:
         def build(hidden: Hidden | None) -> SlamSystem:
             return SlamSystem(
                 self.config if hidden is None else second_time(self.config),
-                build_parts(self.resolved, self.context),
+                self._build(),
                 rectify.camera,
                 self.device,
                 self.events,
@@ -285,6 +286,9 @@ class _Run:
             )
 
     # -- stages ----------------------------------------------------------------------------
+
+    def _build(self) -> Parts:
+        return build_parts(self.resolved, self.context)
 
     def _facts(self) -> dict[str, Any]:
         return {

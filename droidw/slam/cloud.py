@@ -43,7 +43,7 @@ def consistent_depth(
             depth that they began with, about which neighbours agree as well: they neither are
             confirmed nor confirm.
     """
-    known = store.disps if measured is None else store.disps.where(measured, torch.nan)
+    known = store.disps if measured is None else store.disps.masked_fill(~measured, torch.nan)
     count = len(store)
     height, width = store.grid.height, store.grid.width
     views = torch.zeros(count, height, width, dtype=torch.int64, device=store.device)
