@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from droidw.ablation.cells import Outcome
-from droidw.ablation.table import Column, Table
+from droidw.ablation.table import NOT_RUN, Column, Table
 from droidw.eval.svg import Bars, Line, bar_chart, colour, line_chart, path_panels
 
 __all__ = ["make_page"]
@@ -60,7 +60,7 @@ def _table(table: Table, column: Column) -> str:
         cells = [f"<td>{escape(row[0])}</td>"]
         for name, cell in zip(head[1:], row[1:], strict=True):
             css = " class='best'" if best.get(name) == row[0] else ""
-            css = " class='bad'" if cell in ("failed", "not run") else css
+            css = " class='bad'" if cell in ("failed", NOT_RUN) else css
             cells.append(f"<td{css}>{escape(cell)}</td>")
         lines.append("<tr>" + "".join(cells) + "</tr>")
     return f"<table>{''.join(lines)}</table>"

@@ -173,12 +173,10 @@ def _config(name: str, file: Path, reader: _Reader) -> Path:
 
 
 def _sequences(reader: _Reader, data: Path | None, chosen: Sequence[str]) -> dict[str, Footage]:
-    given = reader.tree.get("sequences") or {}
-    if reader.tree.get("sequences") == []:
-        layers: dict[str, Layer] = {}  # there are none, which is told of with what else is missing
-    elif isinstance(given, list):
+    given = reader.tree.get("sequences") or []
+    if isinstance(given, list):
         given = {str(name): {} for name in given}
-        layers = {name: (reader.file, {}) for name in given}
+        layers: dict[str, Layer] = {name: (reader.file, {}) for name in given}
         reader.check_names("sequences", given)
     else:
         layers = reader.layers("sequences")

@@ -11,12 +11,12 @@ from typing import Any
 from droidw.ablation.cells import Cell, Outcome
 from droidw.ablation.plan import Plan
 
-__all__ = ["COLUMNS", "Column", "Entry", "Table", "make_table"]
+__all__ = ["COLUMNS", "NOT_RUN", "Column", "Entry", "Table", "make_table"]
 
 
 # Of an error that is shown, and after the point.
 _SIGNIFICANT, _MOST_DIGITS = 3, 8
-_NOT_RUN = "not run"
+NOT_RUN = "not run"
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Table:
         mine = [(c, o) for c, o in self.cells if (c.row, c.sequence) == (row, sequence)]
         values = [o.metrics[column] for _, o in mine if o is not None and column in o.metrics]
         errors = [
-            (o.error if o is not None else "") or c.missing or _NOT_RUN
+            (o.error if o is not None else "") or c.missing or NOT_RUN
             for c, o in mine
             if o is None or o.error
         ]
@@ -135,7 +135,7 @@ class Table:
         """Cells that have no figures, and why."""
         found = []
         for cell, outcome in self.cells:
-            why = cell.missing or (_NOT_RUN if outcome is None else outcome.error)
+            why = cell.missing or (NOT_RUN if outcome is None else outcome.error)
             if why:
                 found.append((cell, why))
         return found
@@ -212,7 +212,7 @@ class Table:
                     "seed": cell.seed,
                     "folder": f"cells/{cell.name}",
                     "digest": cell.digest,
-                    "error": cell.missing or (_NOT_RUN if outcome is None else outcome.error),
+                    "error": cell.missing or (NOT_RUN if outcome is None else outcome.error),
                     "metrics": {} if outcome is None else dict(outcome.metrics),
                     "facts": {} if outcome is None else dict(outcome.facts),
                 }
@@ -224,8 +224,8 @@ class Table:
 def text(entry: Entry, column: Column) -> str:
     """An entry for a table: mean, spread, and how many seeds where some have none."""
     if entry.mean is None:
-        if set(entry.errors) == {_NOT_RUN}:
-            return _NOT_RUN
+        if set(entry.errors) == {NOT_RUN}:
+            return NOT_RUN
         return "failed" if entry.errors else "-"
     said = f"{entry.mean:.{column.digits}f}"
     if entry.spread is not None:

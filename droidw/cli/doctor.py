@@ -18,6 +18,7 @@ from typing import Any
 from droidw.config.schema import DroidwConfig, SlotConfig
 from droidw.errors import DroidwError
 from droidw.io.dataset_tables import data_root
+from droidw.plugin.cache import user_cache
 from droidw.plugin.manager import Plugins, load_plugins
 from droidw.plugin.registry import KINDS, SLOTS
 
@@ -129,8 +130,7 @@ def _folders(found: Diagnosis, plugins: Plugins) -> None:
     weights = plugins.weights_dir
     files = sorted(p.name for p in weights.iterdir() if p.is_file()) if weights.is_dir() else []
     data = data_root()
-    above = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    cache = Path(os.environ.get("DROIDW_CACHE") or Path(above) / "droidw").expanduser()
+    cache = Path(os.environ.get("DROIDW_CACHE") or user_cache(os.environ)).expanduser()
     known = ", ".join(files) or "empty" if weights.is_dir() else "not there"
     found.facts["folders"] = {
         "weights": f"{weights} ({known})",

@@ -267,8 +267,8 @@ def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
         )
     said = [key for key in ("calib", "focal", "fov") if getattr(config.camera, key) is not None]
     if len(said) > 1:
-        typed_in = [key for key in said if loaded.at(f"camera.{key}").startswith(COMMAND_LINE)]
-        old = next((key for key in said if key not in typed_in), said[0])
+        of_files = (k for k in said if not loaded.at(f"camera.{k}").startswith(COMMAND_LINE))
+        old = next(of_files, said[0])
         raise ConfigError(
             f"{loaded.at('camera.' + said[-1])}: {' and '.join(said)} are given, but only one of "
             "them can hold",

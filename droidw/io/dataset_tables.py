@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from droidw.errors import InputError, did_you_mean
+from droidw.plugin.cache import user_cache
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Camera
@@ -175,8 +176,7 @@ def data_root(environ: Mapping[str, str] = os.environ) -> Path:
     """The folder of datasets: `$DROIDW_DATA`, else in the cache of the user."""
     if environ.get(DATA_VARIABLE):
         return Path(environ[DATA_VARIABLE]).expanduser()
-    cache = environ.get("XDG_CACHE_HOME")
-    return (Path(cache) if cache else Path.home() / ".cache") / "droidw" / "data"
+    return user_cache(environ) / "data"
 
 
 def _sequence(

@@ -22,6 +22,7 @@ __all__ = [
     "keep_rising",
     "picture_folder",
     "read_listing",
+    "without_remark",
 ]
 
 Entry = tuple[int, float, Path]
@@ -47,7 +48,7 @@ def read_listing(path: Path, notes: Notes) -> list[Entry]:
     entries: list[Entry] = []
     position = 0
     for number, line in enumerate(read_text(path, "lines `timestamp filename`").splitlines(), 1):
-        text = re.split(r"(?:^|\s)#", line, maxsplit=1)[0].strip()
+        text = without_remark(line)
         if not text:
             continue
         fields = re.split(r"[\s,]+", text, maxsplit=1)
@@ -69,6 +70,11 @@ def read_listing(path: Path, notes: Notes) -> list[Entry]:
     if not entries:
         raise InputError(f"{path} names no picture", "lines look like `1.033333 rgb/000031.jpg`")
     return entries
+
+
+def without_remark(line: str) -> str:
+    """A line of a listing without its remark, which begins at a # that no name holds."""
+    return re.split(r"(?:^|\s)#", line, maxsplit=1)[0].strip()
 
 
 def keep_rising(entries: Sequence[Entry], notes: Notes) -> list[Entry]:

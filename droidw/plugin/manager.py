@@ -19,6 +19,7 @@ import pluggy
 
 from droidw.errors import PluginError, UsageError, did_you_mean
 from droidw.plugin import hookspecs
+from droidw.plugin.cache import user_cache
 from droidw.plugin.checks import HOOKS, checked_components, explained, import_file, problem_of
 from droidw.plugin.component import Component
 from droidw.plugin.registry import FROM_PYTHON, KINDS, Entry, Failure, Registry
@@ -349,8 +350,7 @@ def _dist(point: metadata.EntryPoint) -> tuple[str, str]:
 def _weights_dir(environ: Mapping[str, str]) -> Path:
     if environ.get(WEIGHTS_VARIABLE):
         return Path(environ[WEIGHTS_VARIABLE]).expanduser()
-    cache = environ.get("XDG_CACHE_HOME")
-    return (Path(cache) if cache else Path.home() / ".cache") / "droidw" / "weights"
+    return user_cache(environ) / "weights"
 
 
 def _split(text: str) -> list[str]:

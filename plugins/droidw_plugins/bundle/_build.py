@@ -19,6 +19,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from droidw.plugin.cache import user_cache
+
 __all__ = [
     "CACHE_VARIABLE",
     "BuildError",
@@ -83,8 +85,7 @@ def kernels_dir(environ: Mapping[str, str] = os.environ) -> Path:
     """Folder of compiled kernels: `$DROIDW_CACHE/kernels`, or below the user's cache folder."""
     if environ.get(CACHE_VARIABLE):
         return Path(environ[CACHE_VARIABLE]).expanduser() / "kernels"
-    cache = environ.get("XDG_CACHE_HOME")
-    return (Path(cache) if cache else Path.home() / ".cache") / "droidw" / "kernels"
+    return user_cache(environ) / "kernels"
 
 
 def compiler_version(compiler: str) -> str:

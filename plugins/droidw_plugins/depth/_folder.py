@@ -18,6 +18,7 @@ import torch
 
 from droidw.errors import ConfigError, InputError
 from droidw.interfaces.depth import DepthMap
+from droidw.io.listing import without_remark
 from droidw_plugins.depth.file import FileDepthOptions
 
 if TYPE_CHECKING:
@@ -202,7 +203,7 @@ def _read_list(listing: Path) -> tuple[list[float], list[Path]]:
     """Times (ascending) and files of a depth.txt; '#' starts a comment."""
     entries: list[tuple[float, Path]] = []
     for number, line in enumerate(listing.read_text(errors="replace").splitlines(), start=1):
-        parts = re.split(r"(?:^|\s)#", line, maxsplit=1)[0].split(maxsplit=1)
+        parts = without_remark(line).split(maxsplit=1)
         if not parts:
             continue
         time = math.nan
