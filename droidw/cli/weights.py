@@ -26,7 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names",
         metavar="NAME|FILE",
         nargs="*",
-        help="fetch, verify: names from the list (verify: all that are there); add: files",
+        help="list, fetch, verify: names from the list (list: all; verify: all that are there); "
+        "add: files",
     )
     parser.add_argument("--all", action="store_true", help="fetch: everything in the list")
     parser.add_argument(
@@ -57,6 +58,9 @@ def main(args: argparse.Namespace) -> int:
     folder = Path(args.folder).expanduser() if args.folder else plugins.weights_dir
     store = WeightsStore(folder, catalogue(plugins.entries()))
     if args.action == "list":
+        if args.names:
+            asked = {store.file(name).name for name in args.names}
+            store.known = {name: known for name, known in store.known.items() if name in asked}
         print(_json(store) if args.json else _listing(store))
         return 0
     if args.action == "verify":
@@ -154,9 +158,10 @@ def _verify(store: WeightsStore, names: list[str]) -> int:
             return 0
     worst = 0
     for name in wanted:
+        there = store.find(store.file(name)) is not None
         try:
             print(f"{name}: ok: {store.verify(name)}")
         except DroidwError as error:
-            print(f"{name}: BAD: {error}")
+            print(f"{name}: {'BAD' if there else 'MISSING'}: {error}")
             worst = max(worst, error.exit_code)
     return worst

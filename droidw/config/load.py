@@ -278,7 +278,8 @@ def _override(text: str) -> tuple[list[str], Any]:
             + " ".join(str(error).split()),
             "quote it for the shell and for YAML, for example: 'input.source=\"a: b\"'",
         ) from error
-    return path, found
+    # In a file that may be a list whose lines are all commented out; typed it means none of them.
+    return path, [] if found is None and key.strip() in LISTED else found
 
 
 def _nested(path: Sequence[str], value: Any) -> _Tree:

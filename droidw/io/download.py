@@ -120,7 +120,8 @@ def download(
         )
     said: list[str] = []
     with _locked_part(target) as part:
-        for url in urls:
+        begun = _begun(part).get("url")
+        for url in sorted(urls, key=lambda one: one != begun):
             transfer = _Transfer(url, target, part, progress, timeout)
             try:
                 transfer.run(attempts, pause)
@@ -164,6 +165,20 @@ def _locked_part(target: Path) -> Iterator[Path]:
         yield part
     if part.is_file() and part.stat().st_size == 0:
         part.unlink()
+
+
+def _begun(part: Path) -> dict[str, str]:
+    """Where the bytes that are here are from, `url`, and what marked their version, `tag`."""
+    try:
+        notes = json.loads(_notes(part).read_text())
+        return {"url": str(notes["url"]), "tag": str(notes["tag"])}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _notes(part: Path) -> Path:
+    """The file beside the bytes that says where they are from."""
+    return part.with_name(part.name + ".json")
 
 
 def _unwritable(target: Path, error: OSError) -> UsageError:
@@ -211,14 +226,18 @@ class _Transfer:
     size: int = 0
     total: int = 0
     confirmed: bool = False
+    ours: bool = False
     redirects: _Redirects = field(default_factory=_Redirects)
 
     def __post_init__(self) -> None:
         if urllib.parse.urlsplit(self.url).scheme not in ("http", "https"):
             raise DownloadError(f"{self.url} is no http or https address")
-        self.notes = self.part.with_name(self.part.name + ".json")
+        self.notes = _notes(self.part)
         self.address = self.url
-        self.tag = self._remembered_tag()
+        begun = _begun(self.part)
+        # Bytes from another address stay until this one has some: it may have nothing.
+        self.ours = begun.get("url") == self.url
+        self.tag = begun["tag"] if self.ours and self._have() else ""
         self.opener = urllib.request.build_opener(
             self.redirects, urllib.request.HTTPCookieProcessor(CookieJar())
         )
@@ -254,21 +273,12 @@ class _Transfer:
             )
 
     def _have(self) -> int:
-        return self.part.stat().st_size
-
-    def _remembered_tag(self) -> str:
-        """What marked the version of the file of which some bytes are here."""
-        try:
-            notes = json.loads(self.notes.read_text())
-            if notes["url"] == self.url and self._have():
-                return str(notes["tag"])
-        except (OSError, ValueError, KeyError, TypeError):
-            pass
-        self._truncate()
-        return ""
+        """Bytes from this address that are here."""
+        return self.part.stat().st_size if self.ours else 0
 
     def _truncate(self) -> None:
         os.truncate(self.part, 0)
+        self.ours = True
         self.notes.unlink(missing_ok=True)
 
     def _ask(self) -> bool:
@@ -314,6 +324,8 @@ class _Transfer:
         block = self._read(answer)
         if have == 0 and looks_like_html(block):
             return self._page(answer, block)
+        if not self.ours:
+            self._truncate()
         tag = answer.headers.get("ETag", "")
         self.tag = tag if tag and not tag.startswith("W/") else ""
         self.tag = self.tag or answer.headers.get("Last-Modified", "")

@@ -190,8 +190,10 @@ class Plugins:
             UsageError: there is no such file.
         """
         if not path.is_file():
+            what = "this is a folder" if path.is_dir() else "there is no such file"
             raise UsageError(
-                f"--plugin {path}: there is no such file", "give the path of a Python file"
+                f"--plugin {path}: {what}",
+                "give the path of a Python file; a package is installed instead: pip install -e .",
             )
         return self._load(_Origin(path.stem, str(path), ""), lambda: import_file(path))
 

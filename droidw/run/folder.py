@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,11 +41,13 @@ class RunFolder:
     Attributes:
         path: the folder. fresh: whether it was not there before.
         replaces: whether it holds an earlier run.
+        lock: open file by which no other run may write there until `finish`, if locks work there.
     """
 
     path: Path
     fresh: bool
     replaces: bool
+    lock: int | None = None
 
     def early(self, name: str) -> Path:
         """Where a file of this name goes before there is anything to keep."""
@@ -71,12 +73,15 @@ class RunFolder:
         self.replaces = False
 
     def finish(self) -> None:
-        """Take back what a run wrote that ended before it had anything to keep."""
+        """Take back what a run wrote that ended before it had anything to keep; free the folder."""
         if self.replaces or {path.name for path in _files(self.path)} <= {*_AT_ONCE}:
             for name in _AT_ONCE:
                 self.early(name).unlink(missing_ok=True)
             if self.fresh and not any(self.path.iterdir()):
                 self.path.rmdir()
+        if self.lock is not None:
+            os.close(self.lock)
+            self.lock = None
 
 
 def prepare(run_dir: Path, overwrite: bool, inputs: Mapping[str, str] | None = None) -> RunFolder:
@@ -86,7 +91,8 @@ def prepare(run_dir: Path, overwrite: bool, inputs: Mapping[str, str] | None = N
         run_dir: the folder. overwrite: whether it may hold an earlier run.
         inputs: key -> path of what this run reads, which must not be replaced.
     Raises:
-        UsageError: the folder holds something, or cannot be written, or is read from.
+        UsageError: the folder holds something, or cannot be written, or is read from, or another
+            run is writing there.
     """
     fresh = not run_dir.exists()
     try:
@@ -107,8 +113,45 @@ def prepare(run_dir: Path, overwrite: bool, inputs: Mapping[str, str] | None = N
             f"{run_dir}: the output folder cannot be written to",
             "give a folder that you may write to: -o FOLDER",
         )
-    if not held:
-        return RunFolder(run_dir, fresh, replaces=False)
+    lock = _locked(run_dir)
+    try:
+        replaces = bool(held) and _may_replace(run_dir, held, overwrite, inputs or {})
+    except UsageError:
+        if lock is not None:
+            os.close(lock)
+        raise
+    return RunFolder(run_dir, fresh, replaces, lock)
+
+
+def _locked(run_dir: Path) -> int | None:
+    """An open file that locks the folder for this process, or None where there are no such locks.
+
+    Raises:
+        UsageError: another run is writing there.
+    """
+    try:
+        import fcntl
+    except ImportError:  # a system without file locks
+        return None
+    lock = os.open(run_dir, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(lock)
+        raise UsageError(
+            f"{run_dir}: another run is writing into this output folder",
+            "give another folder (-o FOLDER), or wait until it has ended",
+        ) from error
+    except OSError:  # a file system without them
+        os.close(lock)
+        return None
+    return lock
+
+
+def _may_replace(
+    run_dir: Path, held: Sequence[str], overwrite: bool, inputs: Mapping[str, str]
+) -> bool:
+    """True where what is `held` in the folder is a run that may be replaced; else an error."""
     shown = ", ".join(held[:4]) + (", ..." if len(held) > 4 else "")
     if not overwrite:
         raise UsageError(
@@ -120,14 +163,14 @@ def prepare(run_dir: Path, overwrite: bool, inputs: Mapping[str, str] | None = N
             f"{run_dir}: --overwrite replaces an earlier run, and this is none (it holds {shown})",
             "give another folder: -o FOLDER",
         )
-    for key, path in (inputs or {}).items():
+    for key, path in inputs.items():
         if Path(path).exists() and Path(path).resolve().is_relative_to(run_dir.resolve()):
             raise UsageError(
                 f"{key}: {path} lies in the output folder {run_dir}, of which --overwrite replaces "
                 "what an earlier run left",
                 "copy it to another place first, or give another folder: -o FOLDER",
             )
-    return RunFolder(run_dir, fresh, replaces=True)
+    return True
 
 
 def listed(run_dir: Path, later: Collection[str]) -> dict[str, str]:

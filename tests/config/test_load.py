@@ -125,6 +125,9 @@ def test_exporters_add_up_and_can_be_switched_off(write):
         "trajectory": {}, "ply": None, "uncertainty": {}, "depth": {}, "colmap": {}, "csv": {},
     }  # fmt: skip
     assert load_config(overrides=["exporters=[ply]"]).data["exporters"] == {"ply": {}}
+    assert load_config(overrides=["exporters=null"]).data["exporters"] == {}
+    blank = write("blank.yaml", "exporters:\n  # ply:\n")
+    assert load_config([blank]).data["exporters"] == load_config().data["exporters"]
 
 
 def test_values_of_flags_are_taken_as_they_are():

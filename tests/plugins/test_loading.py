@@ -235,6 +235,9 @@ def test_file_plugin_that_is_broken_was_asked_for(tmp_path):
     other.write_text(SOUND)
     with pytest.raises(PluginError, match=r"must end in \.py"):
         droidw.load_plugins([other], environ={})
+    with pytest.raises(UsageError, match="this is a folder") as error:
+        droidw.load_plugins([tmp_path], environ={})
+    assert "pip install" in error.value.hint
 
 
 def test_a_plugin_that_exits_is_only_broken(tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from droidw.errors import UsageError
 from droidw.run.folder import prepare
 
 RAISING = """
@@ -176,6 +177,23 @@ def test_until_it_has_something_to_keep_a_run_replaces_nothing(tmp_path):
     left = {Path("config.yaml"): b"of the third", Path("trajectory.tum"): b"other poses"}
     assert contents(tmp_path) == left
     assert sorted(p.name for p in tmp_path.iterdir()) == ["config.yaml", "trajectory.tum"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no file locks")
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_two_runs_do_not_write_into_one_folder(tmp_path, overwrite):
+    first = prepare(tmp_path / "out", overwrite=False)
+    if overwrite:
+        first.early("config.yaml").write_text("of the first")
+    with pytest.raises(UsageError, match="another run is writing into this") as error:
+        prepare(tmp_path / "out", overwrite)
+    assert "-o FOLDER" in error.value.hint
+    if overwrite:
+        assert first.early("config.yaml").read_text() == "of the first"
+    first.finish()
+    second = prepare(tmp_path / "out", overwrite)
+    assert not second.replaces  # the first one left nothing
+    second.finish()
 
 
 def test_overwrite_spares_what_is_no_run(go, footage, tmp_path):

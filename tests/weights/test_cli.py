@@ -50,7 +50,10 @@ def test_list_names_size_licence_and_place(capsys, tmp_path):
     assert main(["weights", "list", *PLUGIN]) == 0
     text = capsys.readouterr().out
     assert "acme-small" in text and "~1.0 kB" in text and "CC BY-NC 4.0" in text
-    assert f"folder: {folder}" in text
+    assert f"folder: {folder}" in text and "fit3d" in text
+    assert main(["weights", "list", "acme-small", *PLUGIN]) == 0
+    text = capsys.readouterr().out
+    assert "acme-small" in text and "fit3d" not in text
 
 
 def test_fetch_then_list_then_verify(capsys, published):
@@ -86,7 +89,8 @@ def test_add_and_its_folder(capsys, published, tmp_path):
         (["add"], 2, "no FILE is given"),
         (["add", "nowhere.pth"], 2, "no such file"),
         (["add", "a", "b", "--name", "acme-big"], 2, "one at a time"),
-        (["verify", "acme-big"], 2, "are not in"),
+        (["verify", "acme-big"], 2, "acme-big: MISSING: the weights 'acme-big' are not in"),
+        (["list", "acme-smal"], 2, "did you mean 'acme-small'"),
     ],
 )
 def test_mistakes_are_told(capsys, arguments, code, said):

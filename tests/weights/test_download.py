@@ -111,6 +111,28 @@ def test_the_second_address_helps_out(site, tmp_path):
         fetch(urls[:1], tmp_path / "other.pth")
 
 
+def test_what_came_from_one_address_outlasts_another_that_has_nothing(site, tmp_path):
+    urls = [f"{site.root}/gone", site.serve("/net.pth", DATA, break_after=[200_000])]
+    urls.append(f"{site.root}/gone-too")
+    with pytest.raises(DownloadError, match=r"404.*broke after 200000 .*404") as error:
+        fetch(urls, tmp_path / "net.pth", attempts=1)
+    assert "it goes on where it stopped" in error.value.hint
+    asked = len(site.requests)
+    got = fetch(urls, tmp_path / "net.pth")
+    assert got.url == urls[1] and got.path.read_bytes() == DATA
+    assert site.asked("Range")[asked:] == ["bytes=200000-"]
+    assert leftovers(tmp_path) == ["net.pth"]
+
+
+def test_what_came_from_one_address_is_not_mixed_with_what_another_sends(site, tmp_path):
+    other = DATA[::-1]
+    one = site.serve("/net.pth", DATA, break_after=[200_000])
+    urls = [one, site.serve("/other.pth", other)]
+    got = fetch(urls, tmp_path / "net.pth", attempts=1)
+    assert got.url == urls[1] and got.path.read_bytes() == other
+    assert site.asked("Range") == [None, None]
+
+
 def test_a_busy_server_is_asked_again_but_not_forever(site, tmp_path):
     url = site.serve("/net.pth", status=503)
     with pytest.raises(DownloadError, match=r"answers 503 .*, 3 times in a row"):
