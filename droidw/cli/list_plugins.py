@@ -196,7 +196,7 @@ def _options(plugins: Plugins, entry: Entry, presets: _Presets) -> str:
     options = _option_rows(entry, presets)
     if not options:
         return "\n".join([*text, "  it has no options"])
-    said = [", ".join(f"{p}: {v}" for p, v in o.get("presets", {}).items()) for o in options]
+    said = [_said(option.get("presets", {})) for option in options]
     shown = any(said)  # a column for what presets set, if they set anything
     rows = [("option", "type", "default", *["in presets"] * shown, "range", "meaning")]
     rows += [
@@ -204,6 +204,14 @@ def _options(plugins: Plugins, entry: Entry, presets: _Presets) -> str:
         for o, v in zip(options, said, strict=True)
     ]
     return "\n".join([*text, "", table(rows, indent=2)])
+
+
+def _said(values: Mapping[str, Any]) -> str:
+    """Value by preset on one line, those together that set the same."""
+    names: dict[str, list[str]] = {}
+    for preset, value in values.items():
+        names.setdefault(str(value), []).append(preset)
+    return "; ".join(f"{', '.join(presets)}: {value}" for value, presets in names.items())
 
 
 def _facts(plugins: Plugins, entry: Entry, presets: _Presets) -> dict[str, Any]:

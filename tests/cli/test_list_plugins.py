@@ -79,7 +79,7 @@ def test_options_that_presets_set(run):
     values = {line.split()[0].removeprefix("uncertainty.options."): line[said] for line in lines}
     assert chosen.keys() < values.keys()
     for key, value in values.items():
-        assert value.strip() == (f"cpu: {chosen[key]}" if key in chosen else "")
+        assert value.strip() == (f"cpu, quick: {chosen[key]}" if key in chosen else "")
     assert "in presets" not in run("--options", "per-pixel")
     (part,) = json.loads(run("--json", "--options", "affine-softplus"))
     assert {o["key"]: o["presets"]["cpu"] for o in part["options"] if "presets" in o} == chosen

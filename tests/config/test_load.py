@@ -193,7 +193,7 @@ def test_values_that_are_none(write, text):
 def test_unknown_preset():
     assert refusal(preset="papr", error=UsageError) == (
         "--preset: no preset is called 'papr'\n"
-        "  did you mean 'paper'?   presets: cpu, droid-slam, paper, auto"
+        "  did you mean 'paper'?   presets: cpu, droid-slam, paper, quick, auto"
     )
 
 
