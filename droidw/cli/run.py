@@ -37,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--preset",
         default=None,
-        help="cpu, paper, droid-slam, or auto: paper where its parts and weights are there, else "
-        "cpu (default: auto, unless a --config file extends a preset or sets every section)",
+        help="cpu, quick, paper, droid-slam, or auto: paper where its parts and weights are there, "
+        "else cpu (default: auto, unless a --config file extends a preset or sets every section)",
     )
     parser.add_argument("--calib", metavar="FILE", help="calibration of the raw pictures")
     parser.add_argument("--focal", metavar="PX", help="focal length in pixels of the raw pictures")
