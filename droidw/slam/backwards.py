@@ -362,7 +362,7 @@ def track_backwards(
         backend.run(lambda done, total: told(count + done))
     except _Stopped:
         return None
-    optimiser.add_reports(frontend.optimiser)
+    optimiser.reports.update(frontend.optimiser.reports)
     return Path.of(store, backend.agreement, backend.weakest).turned(known.T_cw[0])
 
 

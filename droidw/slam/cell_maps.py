@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 __all__ = ["CellMaps"]
 
+# Share of the median depth of a map up to which a depth is none: what is so near fills no cell.
+_NO_DEPTH = 1e-3
+
 
 class CellMaps:
     """Asks the parts of a run for maps of a frame; keeps nothing of it.
@@ -67,6 +70,9 @@ class CellMaps:
                 return blank
             depth = self._picked.sample(upload(predicted, self._device), mode="nearest")
             known = torch.isfinite(depth) & (depth > 0)
+            if bool(known.any()):
+                # Holes may be filled with next to nothing, and one of them would outweigh a map.
+                known &= depth > _NO_DEPTH * depth[known].median()
             return torch.where(known, 1.0 / depth.clamp_min(1e-6), blank)
 
     def unmasked(self, frame: Frame) -> Tensor:

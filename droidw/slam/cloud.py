@@ -13,10 +13,10 @@ from droidw.geometry.projective import depth_there, reproject, viewing_rays
 from droidw.slam.frame import CloudPoints
 
 if TYPE_CHECKING:
-    from droidw.config.schema import CloudConfig
+    from droidw.config.schema import CloudConfig, DroidwConfig
     from droidw.graph.store import KeyframeStore
 
-__all__ = ["consistent_depth", "static_cloud"]
+__all__ = ["confirmed", "consistent_depth", "static_cloud"]
 
 # Neighbours on either side that a depth is compared with (REFERENCE 5.9, with the slip mended).
 _REACH = 3
@@ -68,6 +68,18 @@ def consistent_depth(
         views[first:last] += (agrees & valid).long()
     # A disparity at its lower bound is no measurement, however many views share it.
     return (views >= min_views) & (known > 1.01 * min_disp)
+
+
+def confirmed(store: KeyframeStore, config: DroidwConfig, weight: Tensor) -> Tensor:
+    """`consistent_depth` as a run is configured; `weight` [N,h,w] are gates of the cells."""
+    return consistent_depth(
+        store,
+        config.cloud.relative_threshold,
+        config.cloud.min_views,
+        config.weighting.min_disp,
+        published="droid-w" in config.compat,
+        measured=weight > 0,
+    )
 
 
 def static_cloud(

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from droidw.errors import PluginError
+from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.interfaces.depth import DepthMap
 from droidw.interfaces.uncertainty import UncertaintyReport
+from droidw.solve.problem import Step
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Grid
+    from droidw.interfaces.correspondence import EdgeRequest
+    from droidw.solve.problem import BAProblem
 
-__all__ = ["depth_of", "energy_of", "features_of"]
+__all__ = ["depth_of", "energy_of", "features_of", "step_of", "update_of"]
 
 _MORE = "; the checks in droidw.testing find more (docs/plugins.md)"
 
@@ -56,10 +61,72 @@ def depth_of(found: object, height: int, width: int) -> Tensor | None:
     return found.depth
 
 
+def update_of(found: object, request: EdgeRequest) -> EdgeUpdate:
+    """What correspondence answers of edges.
+
+    Raises:
+        PluginError: it is no EdgeUpdate of float32: target [E,h,w,2], confidence [E,h,w,2 or 3].
+    """
+    wanted, either = tuple(request.coords.shape), (2, 3)
+    if not isinstance(found, EdgeUpdate):
+        said = f"{type(found).__name__}, no EdgeUpdate"
+    elif not _fits(found.target, wanted):
+        said = f"a target that is {_told(found.target)}, not float32 {list(wanted)}"
+    elif not any(_fits(found.confidence, (*wanted[:-1], channels)) for channels in either):
+        said = (
+            f"a confidence that is {_told(found.confidence)}, not float32 "
+            f"{[*wanted[:-1], '2 or 3']}"
+        )
+    else:
+        return found
+    raise PluginError(
+        f"the correspondence operator breaks its contract: `update` returned {said}",
+        "return one target and the information of it for each edge and cell" + _MORE,
+    )
+
+
+def step_of(found: object, problem: BAProblem) -> Step:
+    """What a bundle adjustment backend makes of a problem.
+
+    A step that is not finite is left out: state stays as it was, and the report says so. (On a GPU
+    that is not asked: it would have to be waited for.)
+
+    Raises:
+        PluginError: it is no Step of poses and disparities like those of the problem.
+    """
+    if not isinstance(found, Step):
+        said = f"{type(found).__name__}, no Step"
+    elif not isinstance(found.T_cw, Tensor) or found.T_cw.shape != problem.T_cw.shape:
+        said = f"poses that are {_told(found.T_cw)}, not {list(problem.T_cw.shape)}"
+    elif not isinstance(found.disps, Tensor) or found.disps.shape != problem.disps.shape:
+        said = f"disparities that are {_told(found.disps)}, not {list(problem.disps.shape)}"
+    elif found.disps.device.type != "cpu" or (_finite(found.T_cw) and _finite(found.disps)):
+        return found
+    else:
+        report = replace(found.report, status="nonfinite")
+        return Step(problem.T_cw.clone(), problem.disps.clone(), report)
+    raise PluginError(
+        f"the bundle adjustment backend breaks its contract: `step` returned {said}",
+        "return droidw.solve.problem.Step of new poses [N,7] and disparities [N,h,w]" + _MORE,
+    )
+
+
+def _fits(value: object, shape: tuple[int, ...]) -> bool:
+    return (
+        isinstance(value, Tensor) and tuple(value.shape) == shape and value.dtype == torch.float32
+    )
+
+
+def _finite(values: Tensor) -> bool:
+    return bool(torch.isfinite(values).all())
+
+
 def _told(value: object) -> str:
     shape = getattr(value, "shape", None)
     shape = f" {list(shape)}" if isinstance(shape, tuple) else ""
-    kind = "a tensor" if isinstance(value, torch.Tensor) else type(value).__name__
+    kind = type(value).__name__
+    if isinstance(value, torch.Tensor):
+        kind = "a tensor" if value.dtype == torch.float32 else f"a {value.dtype} tensor"
     return f"{kind}{shape}"
 
 

@@ -12,6 +12,8 @@ from torch import Tensor
 from droidw.geometry.projective import depth_there, reproject
 from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
+from droidw.slam.contract import update_of
+from droidw.slam.stepping import stepped
 from droidw.solve.kernel import redescended, usual_square
 from droidw.solve.problem import BAProblem
 from droidw.solve.weights import residual_weights
@@ -71,9 +73,8 @@ def locate(
             coords, valid = reproject(T_cw, disps, store.intrinsics, ii, jj)
         with optimiser.clock(f"{label}: correspondence"):
             ids = list(range(len(pairs)))
-            answer = session.update(
-                EdgeRequest(ids, sources_of, targets_of, coords, valid, payload)
-            )
+            request = EdgeRequest(ids, sources_of, targets_of, coords, valid, payload)
+            answer = update_of(session.update(request), request)
         weight = residual_weights(
             answer.confidence,
             None,
@@ -107,7 +108,9 @@ def locate(
                 if said is not None:
                     problem = replace(problem, pose_term=said.after(len(used)))
                 problem = redescended(problem, solver, jj - len(used), len(payloads))
-                T_cw = optimiser.parts.ba.step(problem).T_cw
+                step = stepped(optimiser.parts.ba, problem)
+                optimiser.note(step.report)
+                T_cw = step.T_cw
     return T_cw[len(used) :]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -17,8 +18,9 @@ from droidw.geometry.transfer import on_device
 from droidw.interfaces.correspondence import EdgeRequest
 from droidw.interfaces.features import KnowsMovable
 from droidw.interfaces.uncertainty import Begins, Indices, UncertaintyView
-from droidw.slam.contract import energy_of
+from droidw.slam.contract import energy_of, update_of
 from droidw.slam.seen_through import evidence
+from droidw.slam.stepping import stepped
 from droidw.slam.upright import Upright
 from droidw.solve.epipolar import PointMatches, epipolar_term
 from droidw.solve.kernel import redescended, usual_square
@@ -113,7 +115,7 @@ class Optimiser:
         self.begun = self.anew = self.doubtful = False
         self._later = 1.0
         self.points: tuple[PointMatches, float] | None = None
-        self.reports: dict[str, int] = {}
+        self.reports: Counter[str] = Counter()
         self.iterations, self.cost, self.usual = 0, float("nan"), 0.0
 
     def beside(self, store: KeyframeStore) -> Optimiser:
@@ -125,11 +127,6 @@ class Optimiser:
         other.begun, other.anew, other._later = self.begun, self.anew, self._later
         other.doubtful = self.doubtful
         return other
-
-    def add_reports(self, other: Optimiser) -> None:
-        """Count steps of the other that were left out as steps of this one."""
-        for status, count in other.reports.items():
-            self.reports[status] = self.reports.get(status, 0) + count
 
     def begin(self) -> None:
         """Let uncertainty start from what features say of the keyframes so far, if it wants to."""
@@ -182,7 +179,7 @@ class Optimiser:
             doubtful=self.doubtful,
         )
         with self.clock("correspondence"):
-            answer = session.update(request)
+            answer = update_of(session.update(request), request)
         graph.record(rows, answer.target, answer.confidence)
         if answer.damping is not None and answer.sources is not None:
             store["damping"][on_device(answer.sources, store.device)] = answer.damping
@@ -292,8 +289,8 @@ class Optimiser:
         known = self._known(problem, low, motion_prior, settled=solver.cauchy_tuning > 0)
         problem = redescended(replace(problem, pose_term=known), solver)
         problem = self.upright.flat(problem, gates, solver.planes * self.usual)
-        step = self.parts.ba.step(problem)
-        self._note(step.report)
+        step = stepped(self.parts.ba, problem)
+        self.note(step.report)
         self.cost = step.report.cost_before
         store.T_cw[low:] = step.T_cw[:count]
         store.disps[low:] = step.disps[:count]
@@ -313,11 +310,12 @@ class Optimiser:
         terms = [term for term in said if term is not None]
         return reduce(operator.add, terms) if terms else None
 
-    def _note(self, report: Report) -> None:
+    def note(self, report: Report) -> None:
+        """Count a step that was left out, and measurements that were."""
         if report.status != "ok":
-            self.reports[report.status] = self.reports.get(report.status, 0) + 1
+            self.reports[report.status] += 1
         if report.dropped:
-            self.reports["dropped"] = self.reports.get("dropped", 0) + report.dropped
+            self.reports["dropped"] += report.dropped
 
     def gates(self, first: int = 0, learned: bool = True) -> Tensor:
         """Weights in [0,1] of all cells of the keyframes from `first` on, [N-first,h,w].
@@ -396,4 +394,4 @@ class Optimiser:
         self.iterations += 1
         self._part()
         if not math.isfinite(energy_of(report)):
-            self.reports["uncertainty"] = self.reports.get("uncertainty", 0) + 1
+            self.reports["uncertainty"] += 1

@@ -22,13 +22,14 @@ from droidw.slam.backend import Backend
 from droidw.slam.backwards import doubted
 from droidw.slam.between import Between
 from droidw.slam.cell_maps import CellMaps
-from droidw.slam.cloud import consistent_depth, static_cloud
+from droidw.slam.cloud import confirmed, static_cloud
 from droidw.slam.diagnosis import diagnose, parallax, unusable
 from droidw.slam.filler import Filler
 from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
 from droidw.slam.keyframes import Keyframes
+from droidw.slam.metric import scale_to_prior
 from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.records import Outcome, keyframe_records
@@ -294,6 +295,8 @@ class SlamSystem:
                 self._refined(backend.focal)
                 found = replace(found, agreement=backend.agreement, weakest=backend.weakest)
             found = doubted(self.optimiser, self.config, found, self.events, self._stopped)
+        if self.parts.depth.metric and not found.still:
+            scale_to_prior(self.store, confirmed(self.store, self.config, self.optimiser.gates()))
         with self.clock("fill"):
             trajectory = self._trajectory(reread, quick=brief or found.still)
         self._kept.clear()
@@ -384,13 +387,6 @@ class SlamSystem:
         if len(store) == 0:
             return (), static_cloud(store, torch.zeros(0), torch.zeros(0), cloud)
         weight = self.optimiser.gates()
-        valid = consistent_depth(
-            store,
-            cloud.relative_threshold,
-            cloud.min_views,
-            self.config.weighting.min_disp,
-            published="droid-w" in self.config.compat,
-            measured=weight > 0,
-        )
+        valid = confirmed(store, self.config, weight)
         records = keyframe_records(store, valid, weight)
         return records, static_cloud(store, valid, weight, cloud)

@@ -314,6 +314,35 @@ def test_a_part_that_breaks_its_contract_is_named(go, footage, plugin, code, sai
     assert said in ran.err and "bug of droidw" not in ran.err
 
 
+FAULTY = """
+
+import droidw
+from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
+
+class Faulty(TorchBundleAdjuster):
+    left = 3
+    def step(self, problem):
+        step = super().step(problem)
+        if not problem.motion_only:
+            self.left -= 1
+            if self.left == 0:
+                step.disps[0, 2, 3] = float("nan")
+        return step
+
+@droidw.hookimpl
+def droidw_ba_backends():
+    yield droidw.Component("faulty", "one step that is not finite", lambda o, c: Faulty())
+"""
+
+
+def test_a_step_that_is_not_finite_costs_that_step_alone(go, footage, plugin):
+    """What is no number would end the process in a search that sets out from it."""
+    ran = go(footage(count=14).folder, "--plugin", plugin(FAULTY), "ba=faulty")
+    assert ran.code == 0, ran.err
+    assert len(ran.poses) == 14
+    assert "1 bundle adjustment steps were not finite and were left out" in ran.warnings
+
+
 SHAPES = """
 import numpy as np, torch, droidw
 from droidw.interfaces.depth import DepthMap

@@ -18,6 +18,8 @@ __all__ = ["Expected", "Raster"]
 # Pixels by which a cell moves otherwise than those around it, from which on its depth is taken to
 # be wrong: seen through that, all around it would be torn.
 _STRAY = 2.0
+# Displacement of what is infinitely far off, pixels: beyond any picture.
+_NOWHERE = 1e6
 # Cells in a row, of which two second differences are known.
 _FOUR = 4
 
@@ -43,7 +45,9 @@ class Raster:
             settled: cells that stray from those around them go with them.
             curved: flow may bend between cells; else it is straight.
         """
-        flow = np.ascontiguousarray(self.moved(target, a), dtype=np.float32)
+        # OpenCV's search ends the process where it is to set out from what is no number.
+        moved = np.nan_to_num(self.moved(target, a), posinf=_NOWHERE, neginf=-_NOWHERE)
+        flow = np.ascontiguousarray(moved, dtype=np.float32)
         if settled:
             flow = _settled(flow)
         height, width = a.grey.shape
