@@ -265,6 +265,13 @@ def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
             f"{loaded.at('camera.size')}: {size} is not a working size",
             "valid: [width, height], each at least 16, or [] to follow camera.long_side",
         )
+    least, most = config.weighting.min_disp, config.weighting.max_disp
+    if 0 < most <= least:
+        raise ConfigError(
+            f"{loaded.at('weighting.max_disp')}: {most:g} is not more than weighting.min_disp, "
+            f"{least:g}, and nothing lies between",
+            "valid: a larger one, or 0 for none",
+        )
     said = [key for key in ("calib", "focal", "fov") if getattr(config.camera, key) is not None]
     if len(said) > 1:
         of_files = (k for k in said if not loaded.at(f"camera.{k}").startswith(COMMAND_LINE))

@@ -12,7 +12,7 @@ import torch
 
 from droidw.errors import MissingRequirementError
 from droidw.plugin.component import BuildContext
-from droidw.solve.problem import PoseTerm
+from droidw.solve.problem import PoseTerm, Report, Step
 from droidw_plugins.bundle import _kernel_calls, cuda_ba
 from droidw_plugins.bundle._build import BuildError
 from droidw_plugins.bundle._kernel_layout import TILE, make_kernel_layout
@@ -124,6 +124,35 @@ def test_a_library_of_another_kind_is_refused(tmp_path):
     wrong.write_bytes(b"no library at all")
     with pytest.raises(BuildError, match="cannot be loaded"):
         _kernel_calls.KernelLibrary(wrong)
+
+
+def test_a_library_made_beforehand_has_to_be_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setenv(_kernel_calls.PREBUILT_VARIABLE, str(tmp_path / "gone.so"))
+    with pytest.raises(BuildError, match=r"DROIDW_CUDA_KERNELS names .*gone\.so, which is no file"):
+        _kernel_calls.KernelLibrary.for_cuda()
+
+
+@pytest.mark.parametrize("status", ["singular", None])
+def test_kernels_that_cannot_run_are_refused_before_a_run(monkeypatch, status):
+    """As with a driver older than the compiler: all is well until the first launch."""
+
+    class Failing:
+        def __init__(self, options, device):
+            pass
+
+        def step(self, problem):
+            if status is None:
+                raise RuntimeError("35 CUDA driver version is insufficient")
+            return Step(problem.T_cw, problem.disps, Report(status, 1.0))
+
+    monkeypatch.setattr(cuda_ba, "CudaBundleAdjuster", Failing)
+    with pytest.raises(MissingRequirementError, match="ba 'cuda' cannot run here") as error:
+        cuda_ba.COMPONENT.factory(
+            cuda_ba.CudaBundleOptions(), BuildContext(device=torch.device("cpu"))
+        )
+    assert (status or "driver version") in error.value.message
+    assert "ba=torch" in error.value.hint
 
 
 def needs_nvcc():

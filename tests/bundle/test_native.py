@@ -12,7 +12,7 @@ import torch
 from droidw.errors import MissingRequirementError
 from droidw.plugin.component import BuildContext
 from droidw.plugin.manager import load_plugins
-from droidw_plugins.bundle import _build, _native_calls, auto_ba, native_ba
+from droidw_plugins.bundle import _build, _kernel_calls, _native_calls, auto_ba, native_ba
 from droidw_plugins.bundle._native_calls import native_recipe
 
 CPU = BuildContext(device=torch.device("cpu"))
@@ -34,6 +34,24 @@ def broken_compiler(tmp_path, monkeypatch):
     fake.chmod(fake.stat().st_mode | stat.S_IEXEC)
     monkeypatch.setenv("CXX", str(fake))
     monkeypatch.setenv(_build.CACHE_VARIABLE, str(tmp_path / "cache"))
+
+
+@pytest.mark.parametrize("launcher", ["ccache", "sccache"])
+def test_what_launches_the_compiler_is_none(compiler, monkeypatch, launcher):
+    found = native_recipe().compiler
+    monkeypatch.setenv("CXX", f"{launcher} {found} -O2")
+    assert native_recipe().compiler == found
+
+
+def test_a_compiler_that_is_no_program_is_told_of(compiler, monkeypatch, tmp_path):
+    monkeypatch.setenv(_build.CACHE_VARIABLE, str(tmp_path))
+    odd = tmp_path / "odd-c++"
+    odd.write_bytes(b"\x7fELF of another machine")
+    odd.chmod(0o755)
+    recipe = replace(native_recipe(), compiler=str(odd))
+    with pytest.raises(_build.BuildError, match=r"could not compile the kernels(.|\n)*Exec format"):
+        _build.build(recipe)
+    assert _kernel_calls.known_architectures(str(odd)) == []
 
 
 def test_the_number_of_threads_changes_no_byte(make, compiler):

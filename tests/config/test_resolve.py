@@ -79,6 +79,9 @@ PHASES = ", ".join(DroidwConfig().schedule)
          "camera.fov: calib and fov are given, but only one of them can hold\n  give one of "
          "--calib FILE, --focal PIXELS, --fov DEGREES; one that a file sets is off with "
          "camera.calib=null"),
+        ("weighting={min_disp: 2, max_disp: 1}",
+         "weighting.max_disp: 1 is not more than weighting.min_disp, 2, and nothing lies between\n"
+         "  valid: a larger one, or 0 for none"),
         ("camera.size=[3]",
          "camera.size: [3] is not a working size\n  valid: [width, height], each at least 16, "
          "or [] to follow camera.long_side"),

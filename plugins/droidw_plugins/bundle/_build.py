@@ -140,7 +140,11 @@ def _compile(recipe: Recipe, library: Path) -> None:
         for flags in recipe.attempts:
             command = [recipe.compiler, *flags, str(_SOURCES / recipe.source), "-o", str(made)]
             _log.info("compiling kernels '%s' once: %s", recipe.name, " ".join(command))
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            try:
+                done = subprocess.run(command, capture_output=True, text=True, check=False)
+            except OSError as error:  # it is there, but no program for this machine
+                said = said or str(error)
+                continue
             if done.returncode == 0 and made.is_file():
                 os.replace(made, library)
                 note.unlink(missing_ok=True)

@@ -124,9 +124,12 @@ def prebuilt() -> Path | None:
 
 def known_architectures(nvcc: str) -> list[int]:
     """Compute capabilities, times ten, that this nvcc can compile for, as far as we care."""
-    done = subprocess.run(
-        [nvcc, "--list-gpu-code"], capture_output=True, text=True, check=False, timeout=60
-    )
+    try:
+        done = subprocess.run(
+            [nvcc, "--list-gpu-code"], capture_output=True, text=True, check=False, timeout=60
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return []  # to compile with it will say why
     digits = [line.partition("sm_")[2] for line in done.stdout.split()]
     return sorted({int(d) for d in digits if d.isdigit() and OLDEST <= int(d) <= NEWEST})
 
@@ -208,6 +211,10 @@ class KernelLibrary:
             raise BuildError("torch sees no GPU; run on the CPU: device=cpu")
         made = prebuilt()
         if made is not None:
+            if not made.is_file():
+                raise BuildError(
+                    f"{PREBUILT_VARIABLE} names {made}, which is no file; name one, or unset it"
+                )
             return cls(made)
         recipe = cuda_recipe(device)
         if recipe is None:

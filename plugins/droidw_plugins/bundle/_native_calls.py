@@ -28,6 +28,7 @@ __all__ = ["NativeKernels", "NativeLibraries", "native_recipe"]
 _VERSION = 4
 _STATUS = ("ok", "rejected", "singular", "nonfinite", "empty")
 _COMPILERS = ("c++", "g++", "clang++")
+_LAUNCHERS = ("ccache", "sccache", "distcc", "icecc")
 _PLAIN = ("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC")
 
 
@@ -63,7 +64,8 @@ def native_recipe(dtype: torch.dtype = torch.float32) -> Recipe | None:
     Args:
         dtype: of the numbers that they work on, float32 or float64.
     """
-    wanted = os.environ.get("CXX", "").split()
+    # What makes a cache of compilers is none, and ours has no need of it.
+    wanted = [word for word in os.environ.get("CXX", "").split() if word not in _LAUNCHERS]
     compiler = first_found([*wanted[:1], *_COMPILERS])
     if not compiler:
         return None

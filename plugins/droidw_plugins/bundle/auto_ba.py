@@ -47,6 +47,7 @@ class AutoBundleAdjuster:
 def _build(options: AutoBundleOptions, context: BuildContext) -> BundleAdjuster:
     """`cuda` on a GPU and `native` on a CPU if their kernels can be compiled, else `torch`."""
     from droidw_plugins.bundle import cuda_ba, native_ba, torch_ba
+    from droidw_plugins.bundle._trial import try_step
 
     backend: BundleAdjuster
     chosen, kind = ("cuda", "GPU") if context.device.type == "cuda" else ("native", "processor")
@@ -59,7 +60,7 @@ def _build(options: AutoBundleOptions, context: BuildContext) -> BundleAdjuster:
         else:
             native = native_ba.NativeBundleOptions(halvings=options.halvings)
             backend = native_ba.COMPONENT.factory(native, context)
-        _try(backend, context)
+        try_step(backend, context.device)
         reason = f"its kernels are compiled for this {kind}"
     except (MissingRequirementError, RuntimeError) as error:
         chosen, reason = "torch", str(error)
@@ -68,39 +69,6 @@ def _build(options: AutoBundleOptions, context: BuildContext) -> BundleAdjuster:
         )
     _log.info("ba: auto takes '%s': %s", chosen, reason)
     return AutoBundleAdjuster(chosen, reason, backend)
-
-
-def _try(backend: BundleAdjuster, context: BuildContext) -> None:
-    """One step on a tiny problem, so that kernels that compile but cannot run are found out now.
-
-    Raises:
-        RuntimeError: it did not end as it must.
-    """
-    import torch
-
-    from droidw.geometry.projective import pixel_grid
-    from droidw.geometry.se3 import identity
-    from droidw.solve.problem import BAProblem
-
-    device = context.device
-    T_cw = identity(2, device=device)
-    T_cw[1, 0] = 0.1
-    target = pixel_grid(4, 4, device=device)[None] + 0.05
-    status = backend.step(
-        BAProblem(
-            T_cw=T_cw,
-            disps=torch.ones(2, 4, 4, device=device),
-            intrinsics=torch.tensor([4.0, 4.0, 1.5, 1.5], device=device),
-            ii=torch.tensor([0], device=device),
-            jj=torch.tensor([1], device=device),
-            target=target,
-            weight=torch.ones_like(target),
-            fixed=torch.tensor([True, False], device=device),
-            damping=torch.ones(2, 4, 4, device=device),
-        )
-    ).report.status
-    if status != "ok":
-        raise RuntimeError(f"a step of its kernels on a tiny problem ended with '{status}'")
 
 
 COMPONENT: Component[BundleAdjuster] = Component(

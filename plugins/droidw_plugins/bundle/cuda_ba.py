@@ -58,12 +58,21 @@ class CudaBundleAdjuster:
 
 def _build(options: CudaBundleOptions, context: BuildContext) -> BundleAdjuster:
     from droidw_plugins.bundle._build import BuildError
+    from droidw_plugins.bundle._trial import try_step
 
     try:
-        return CudaBundleAdjuster(options, context.device)
+        backend = CudaBundleAdjuster(options, context.device)
+        # A driver may be older than the compiler, and kernels made beforehand for another GPU.
+        try_step(backend, context.device)
     except BuildError as error:
         what, _, hint = str(error).partition("; ")
         raise MissingRequirementError(f"ba 'cuda' cannot run here: {what}", hint) from error
+    except RuntimeError as error:
+        raise MissingRequirementError(
+            f"ba 'cuda' cannot run here: {error}",
+            "the torch backend runs on the GPU without own kernels: ba=torch",
+        ) from error
+    return backend
 
 
 def _available() -> str:
