@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 __all__ = ["scale_to_prior"]
 
+# Cells of which a median says something.
+_ENOUGH = 100
+
 _log = logging.getLogger(__name__)
 
 
@@ -27,11 +30,12 @@ def scale_to_prior(store: KeyframeStore, valid: Tensor) -> float:
         valid: bool [N,h,w], cells whose depth was measured and confirmed. Others keep what the
             prior said when they began, and would hold on to the scale of that time.
     Returns:
-        The factor by which all was too small; 1 where the prior knows none of these cells.
+        The factor by which all was too small; 1 where the prior knows fewer than a hundred of these
+        cells.
     """
     prior = store["prior"]
     known = valid & (prior > 0) & (store.disps > 0)
-    if not bool(known.any()):
+    if int(known.sum()) < _ENOUGH:
         return 1.0
     factor = math.exp(float((store.disps[known].log() - prior[known].log()).median()))
     store.T_cw[:, :3].mul_(factor)

@@ -11,13 +11,13 @@ import torch
 from droidw.geometry.camera import Grid
 from droidw.slam.metric import scale_to_prior
 
-H, W, COUNT, DRIFT = 6, 8, 5, 1.17
+H, W, COUNT, DRIFT = 8, 12, 5, 1.17
 
 
 @pytest.fixture
 def drifted(arc, waves, stored):
     """A store whose scale has drifted, and what it was before."""
-    grid, intrinsics = Grid(H, W, 8, 3.5), torch.tensor([82.0, 82.0, 31.5, 23.5])
+    grid, intrinsics = Grid(H, W, 8, 3.5), torch.tensor([82.0, 82.0, 47.5, 31.5])
     T_cw, disps = arc(COUNT), waves(COUNT, H, W)
     smaller = T_cw.clone()
     smaller[:, :3] /= DRIFT
@@ -47,12 +47,14 @@ def test_what_is_unknown_or_unconfirmed_or_stray_has_no_say(drifted):
     torch.testing.assert_close(store.T_cw, T_cw)
 
 
-@pytest.mark.parametrize("lacks", ["prior", "valid"])
-def test_where_nothing_is_known_nothing_changes(drifted, lacks):
+@pytest.mark.parametrize("lacks", ["prior", "valid", "all but a few"])
+def test_where_next_to_nothing_is_known_nothing_changes(drifted, lacks):
     store, _, _ = drifted
     valid = torch.full((COUNT, H, W), lacks != "valid")
     if lacks == "prior":
         store["prior"].zero_()
+    if lacks == "all but a few":
+        valid[1:] = False
     before = store.T_cw.clone(), store.disps.clone()
     factor = scale_to_prior(store, valid)
     assert factor == 1.0 and math.isfinite(factor)
