@@ -46,7 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", metavar="A,B", help="only these rows of the file")
     parser.add_argument("--seeds", metavar="0,1", help="these seeds instead of those of the file")
     parser.add_argument(
-        "--preset", help="cpu, paper or auto, instead of what the file says (default: auto)"
+        "--preset",
+        help="cpu, quick, paper, droid-slam or auto, instead of what the file says (default: auto)",
     )
     parser.add_argument(
         "--jobs", metavar="N", type=int, default=1, help="cells at a time (default: 1)"

@@ -26,6 +26,7 @@ from droidw.errors import (
     PluginError,
     did_you_mean,
 )
+from droidw.geometry.sizes import SMALLEST
 from droidw.plugin.component import Component
 from droidw.plugin.manager import Plugins
 from droidw.plugin.registry import FETCH, SLOTS, Entry, PluginNotFound
@@ -260,10 +261,10 @@ def _joined(problems: Sequence[DroidwError], loaded: LoadedConfig) -> DroidwErro
 def _check_values(config: DroidwConfig, loaded: LoadedConfig) -> None:
     """What types and ranges of single keys cannot say."""
     size = config.camera.size
-    if size and (len(size) != 2 or min(size) < 16):
+    if size and (len(size) != 2 or min(size) < SMALLEST):
         raise ConfigError(
             f"{loaded.at('camera.size')}: {size} is not a working size",
-            "valid: [width, height], each at least 16, or [] to follow camera.long_side",
+            f"valid: [width, height], each at least {SMALLEST}, or [] to follow camera.long_side",
         )
     least, most = config.weighting.min_disp, config.weighting.max_disp
     if 0 < most <= least:

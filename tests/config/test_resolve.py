@@ -83,7 +83,7 @@ PHASES = ", ".join(DroidwConfig().schedule)
          "weighting.max_disp: 1 is not more than weighting.min_disp, 2, and nothing lies between\n"
          "  valid: a larger one, or 0 for none"),
         ("camera.size=[3]",
-         "camera.size: [3] is not a working size\n  valid: [width, height], each at least 16, "
+         "camera.size: [3] is not a working size\n  valid: [width, height], each at least 32, "
          "or [] to follow camera.long_side"),
         ("camera=3",
          "camera: 3 is not valid here\n  expected a section with keys: calib, focal, fov, "
