@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
     from droidw.slam.frame import Frame
 
-__all__ = ["DepthMap", "DepthPrior"]
+__all__ = ["DepthMap", "DepthPrior", "GoesWithFocal"]
 
 
 @dataclass(frozen=True)
@@ -33,3 +33,17 @@ class DepthPrior(Protocol):
     def predict(self, frame: Frame) -> DepthMap | None:
         """Depth of one keyframe at the size of `frame.image`, or None where there is none."""
         ...
+
+
+@runtime_checkable
+class GoesWithFocal(Protocol):
+    """What a prior may say besides: twice the focal length makes its depths twice as large.
+
+    So it is with a network that knows one camera, and has its depths scaled to that of the frame.
+    Where global adjustment finds another focal length afterwards, the scale of the result follows.
+
+    Attributes:
+        goes_with_focal: whether it is so. What was measured is not.
+    """
+
+    goes_with_focal: bool

@@ -29,7 +29,7 @@ from droidw.slam.focal import FocalSearch
 from droidw.slam.frame import CloudPoints, Frame, KeyframeRecord, Trajectory
 from droidw.slam.frontend import Frontend
 from droidw.slam.keyframes import Keyframes
-from droidw.slam.metric import scale_to_prior
+from droidw.slam.metric import deeper, scale_to_prior
 from droidw.slam.motion_filter import Encoded, MotionFilter, Verdict
 from droidw.slam.optimise import Optimiser, Parts
 from droidw.slam.records import Outcome, keyframe_records
@@ -296,7 +296,8 @@ class SlamSystem:
                 found = replace(found, agreement=backend.agreement, weakest=backend.weakest)
             found = doubted(self.optimiser, self.config, found, self.events, self._stopped)
         if self.parts.depth.metric and not found.still:
-            scale_to_prior(self.store, confirmed(self.store, self.config, self.optimiser.gates()))
+            valid = confirmed(self.store, self.config, self.optimiser.gates())
+            scale_to_prior(self.store, valid, deeper(self.parts.depth, self.focal))
         with self.clock("fill"):
             trajectory = self._trajectory(reread, quick=brief or found.still)
         self._kept.clear()

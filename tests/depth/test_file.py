@@ -70,7 +70,46 @@ def test_by_file_stem(tmp_path: Path) -> None:
     assert _depth(prior, _frame(index=0)) is None
     auto = _prior(tmp_path)
     assert _depth(auto, _frame(index=0, name="frame_b.jpg")) == pytest.approx(3.0)
-    assert _depth(auto, _frame(index=0, name="other.jpg")) == pytest.approx(1.0)
+    assert _depth(auto, _frame(index=0, name="other.jpg")) is None  # not that of another frame
+
+
+def test_a_frame_without_a_map_does_not_get_that_of_another(tmp_path: Path) -> None:
+    for number in (0, 10, 20):
+        _png(tmp_path / f"frame_{number:04d}.png", 100 + number)
+    prior = _prior(tmp_path, scale=1.0)
+    names = [f"frame_{number:04d}.jpg" for number in (1, 2, 10, 20, 21)]
+    found = [_depth(prior, _frame(index=i, name=name)) for i, name in enumerate(names, start=1)]
+    assert found == [None, None, 110.0, 120.0, None]
+
+
+def test_numbers_of_pictures_that_begin_anywhere(tmp_path: Path) -> None:
+    for number in (100, 110, 120):
+        _png(tmp_path / f"{number:06d}.png", number)
+    prior = _prior(tmp_path, scale=1.0)
+    # pictures 000000, 000001, ... of which every tenth has a map
+    assert _depth(prior, _frame(index=0, name="000000.png")) is None
+    assert _depth(prior, _frame(index=110, name="000110.png")) == pytest.approx(110.0)
+    assert _depth(prior, _frame(index=200, name="000200.png")) is None
+
+
+@pytest.mark.parametrize("match", ["auto", "index"])
+def test_maps_that_are_numbered_from_1(tmp_path: Path, match: str) -> None:
+    for number in (1, 2, 3):
+        _png(tmp_path / f"{number:06d}.png", number)
+    prior = _prior(tmp_path, scale=1.0, match=match)
+    # as pictures of a video are called, which are counted from 0
+    found = [_depth(prior, _frame(index=i, name=f"{i:06d}")) for i in range(4)]
+    assert found == [1.0, 2.0, 3.0, None]
+
+
+def test_names_that_are_seconds(tmp_path: Path) -> None:
+    for stamp in ("1305.150", "1305.183"):
+        _png(tmp_path / f"{stamp}.png", int(stamp[-3:]))
+    for match in ("auto", "time"):
+        prior = _prior(tmp_path, scale=1.0, match=match)
+        near = _frame(index=9, time=1305.185, name="1305.185.png")
+        far = _frame(index=10, time=1306.5, name="1306.500.png")
+        assert [_depth(prior, near), _depth(prior, far)] == [183.0, None]
 
 
 def test_nearest_stamp_of_a_list(tmp_path: Path) -> None:
@@ -138,6 +177,11 @@ def test_other_sizes_are_resized_to_the_nearest_value(tmp_path: Path) -> None:
 def test_bad_folders_and_lists_are_sentences(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"depth\.options\.path=FOLDER"):
         COMPONENT.factory(FileDepthOptions(), CPU)
+    _png(tmp_path / "one.png", 1)
+    with pytest.raises(InputError, match=r"one\.png is one depth map") as refused:
+        _prior(tmp_path / "one.png")
+    assert f"depth.options.path={tmp_path}" in refused.value.hint
+    (tmp_path / "one.png").unlink()
     with pytest.raises(InputError, match="there is no folder"):
         _prior(tmp_path / "absent")
     with pytest.raises(InputError, match="holds no depth maps"):

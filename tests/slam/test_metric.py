@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from droidw.geometry.camera import Grid
-from droidw.slam.metric import scale_to_prior
+from droidw.slam.focal import FocalSearch
+from droidw.slam.metric import deeper, scale_to_prior
 
 H, W, COUNT, DRIFT = 8, 12, 5, 1.17
 
@@ -59,3 +61,15 @@ def test_where_next_to_nothing_is_known_nothing_changes(drifted, lacks):
     factor = scale_to_prior(store, valid)
     assert factor == 1.0 and math.isfinite(factor)
     assert torch.equal(store.T_cw, before[0]) and torch.equal(store.disps, before[1])
+
+
+def test_a_prior_that_goes_with_the_focal_length_follows_it(drifted):
+    store, T_cw, disps = drifted
+    valid, found = torch.ones(COUNT, H, W, dtype=torch.bool), FocalSearch(0.8, ())
+    measured = SimpleNamespace(metric=True)
+    network = SimpleNamespace(metric=True, goes_with_focal=True)
+    says_no = SimpleNamespace(metric=True, goes_with_focal=False)
+    assert deeper(measured, found) == deeper(says_no, found) == deeper(network, None) == 1.0
+    assert scale_to_prior(store, valid, deeper(network, found)) == pytest.approx(0.8 * DRIFT)
+    torch.testing.assert_close(store.T_cw[:, :3], 0.8 * T_cw[:, :3])
+    torch.testing.assert_close(store.disps, disps / 0.8)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import contextlib
 import logging
 import math
@@ -19,6 +18,8 @@ import torch
 from droidw.errors import ConfigError, InputError
 from droidw.interfaces.depth import DepthMap
 from droidw.io.listing import without_remark
+from droidw.io.masks import seconds_in_names
+from droidw_plugins.depth._lookup import Lookup
 from droidw_plugins.depth.file import FileDepthOptions
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 
 class FileDepth:
-    """Depth maps of a folder, found by time, by file name or by position of the frame.
+    """Depth maps of a folder, found by time, by file name or by position of the frame: `Lookup`.
 
     A frame without a map gets none; `found` and `missing` count what was asked for.
 
@@ -43,7 +44,7 @@ class FileDepth:
         metric: as the options say.
         available: number of maps. found, missing: frames asked for, with and without a map.
     Raises:
-        ConfigError: no path is given, or `match="time"` without a list of times.
+        ConfigError: no path is given, or `match="time"` where no times are known.
         InputError: the folder is missing or holds no depth maps, or the list is broken.
     """
 
@@ -63,9 +64,14 @@ class FileDepth:
             )
         folder = path if path.is_dir() else path.parent
         listing = path / _LIST if path.is_dir() else path
-        self._times: list[float] = []
+        if listing.suffix.lower() in _SUFFIXES:
+            raise InputError(
+                f"depth.options.path: {path} is one depth map",
+                f"give the folder that holds the maps: depth.options.path={folder}",
+            )
+        times: list[float] = []
         if listing.is_file():
-            self._times, self._files = _read_list(listing)
+            times, self._files = _read_list(listing)
         else:
             found = (f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES)
             self._files = sorted(found, key=_natural)
@@ -74,15 +80,14 @@ class FileDepth:
                 f"{folder} holds no depth maps",
                 "expected are 16-bit .png files, or .npy or .npz files with one array each",
             )
-        if options.match == "time" and not self._times:
+        if options.match == "time" and not times and seconds_in_names(self._files) is None:
             raise ConfigError(
-                f"depth.options.match: 'time' needs {folder / _LIST} with 'time file' in each line",
+                f"depth.options.match: 'time' needs {folder / _LIST} with 'time file' in each "
+                "line, or names that are seconds",
                 "or choose depth.options.match=name or =index",
             )
-        self._by_stem = {file.stem: file for file in self._files}
-        self._by_number = {
-            int(file.stem): file for file in self._files if re.fullmatch(r"[0-9]+", file.stem)
-        }
+        rule = None if options.match == "auto" else options.match
+        self._lookup = Lookup(self._files, times, rule, options.max_time_gap)
         self.available = len(self._files)
         self.found = 0
         self.missing = 0
@@ -96,7 +101,7 @@ class FileDepth:
         Raises:
             InputError: the file exists but cannot be read as a depth map.
         """
-        file = self._find(frame)
+        file = self._lookup.of(frame)
         if file is None or not file.is_file():
             self.missing += 1
             if self.missing == 1:
@@ -119,29 +124,6 @@ class FileDepth:
             columns = (np.arange(width) * 2 + 1) * depth.shape[1] // (2 * width)
             depth = depth[rows[:, None], columns]
         return DepthMap(torch.from_numpy(depth).to(frame.image.device))
-
-    def _find(self, frame: Frame) -> Path | None:
-        match = self._options.match
-        if match == "time" or (match == "auto" and self._times):
-            return self._nearest(frame.time)
-        if match in ("auto", "name") and frame.name:
-            file = self._by_stem.get(Path(frame.name).stem)
-            if file is not None or match == "name":
-                return file
-        if match == "name":
-            return None
-        # Numbered files keep their number, others their place in the alphabet.
-        if len(self._by_number) == len(self._files):
-            return self._by_number.get(frame.index)
-        return self._files[frame.index] if 0 <= frame.index < len(self._files) else None
-
-    def _nearest(self, time: float) -> Path | None:
-        place = bisect.bisect_left(self._times, time)
-        near = [k for k in (place - 1, place) if 0 <= k < len(self._times)]
-        best = min(near, key=lambda k: abs(self._times[k] - time))
-        if abs(self._times[best] - time) > self._options.max_time_gap:
-            return None
-        return self._files[best]
 
 
 def read_depth(file: Path, scale: float) -> npt.NDArray[np.float32]:

@@ -106,7 +106,7 @@ class Metric3dDepth:
                     "give BuildContext(camera=...), or leave compat=[droid-w] out for metres",
                 )
             self._factor = context.camera.fx / _FOCAL
-        self.metric = self._factor is None
+        self.metric = self.goes_with_focal = self._factor is None
         path, state = read_published(record, options.weights, context.weights_dir)
         with blaming(path):
             self._network = load_metric3d(options.variant, state, context.device, self._product)

@@ -35,8 +35,11 @@ class FileDepthOptions:
     match: Literal["auto", "index", "name", "time"] = field(
         default="auto",
         metadata={
-            "help": "how maps belong to frames: time (with depth.txt), file name, or position "
-            "of the frame in the source; auto: the first of these that can apply"
+            "help": "how maps belong to frames: time (with depth.txt, or names that are seconds), "
+            "file name, or position of the frame in the source (numbers as names count frames from "
+            "0, but 1, 2, 3 and so on without a gap from 1); auto: time with depth.txt, else name "
+            "where maps are called like pictures, else time or position; a frame without a map of "
+            "its own gets none"
         },
     )
     max_time_gap: float = field(
