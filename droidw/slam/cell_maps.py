@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import torch
@@ -70,9 +71,8 @@ class CellMaps:
                 return blank
             depth = self._picked.sample(upload(predicted, self._device), mode="nearest")
             known = torch.isfinite(depth) & (depth > 0)
-            if bool(known.any()):
-                # Holes may be filled with next to nothing, and one of them would outweigh a map.
-                known &= depth > _NO_DEPTH * depth[known].median()
+            # Holes may be filled with next to nothing, and one of them would outweigh a map.
+            known &= depth > _NO_DEPTH * _median(depth, known)
             return torch.where(known, 1.0 / depth.clamp_min(1e-6), blank)
 
     def unmasked(self, frame: Frame) -> Tensor:
@@ -80,3 +80,10 @@ class CellMaps:
         if frame.mask is None:
             return torch.ones(self._grid.height, self._grid.width, device=self._device)
         return unmasked(self._grid.covered(upload(frame.mask, self._device)))
+
+
+def _median(values: Tensor, known: Tensor) -> Tensor:
+    """The median [1] of those values that are known, infinite if none is: no host waits for it."""
+    ordered = torch.where(known, values, math.inf).flatten().sort().values
+    middle = torch.div(known.sum() - 1, 2, rounding_mode="floor").clamp_min(0)
+    return ordered.gather(0, middle[None])

@@ -76,6 +76,12 @@ def test_waits_of_the_inner_loop(watch, arguments):
     assert len(counts["window"]) > 1, "no window was run"
 
 
+def test_a_depth_prior_costs_a_keyframe_nothing(watch):
+    small = "depth={name: metric3d, options: {variant: vit-small, size: [56, 84]}}"
+    counts, gpu = watch(*DROID, small)
+    assert set(counts["append"][1:]) == {0}, gpu.waits_by_line()
+
+
 def test_calibrated_similarities_cost_one_more(watch):
     counts, gpu = watch(*DROID, "weighting.similarity=matched")
     assert set(counts["learn"]) <= {1, 2} and 2 in counts["learn"], gpu.waits_by_line()

@@ -91,3 +91,28 @@ def test_evidence_is_the_information_of_the_classes_that_move() -> None:
 def test_sizes_that_make_no_picture_are_refused(scales: list[float]) -> None:
     with pytest.raises(ConfigError, match="movable_scales"):
         CnnFeatures(CnnOptions(movable_scales=scales), BuildContext(CPU))
+
+
+@pytest.mark.parametrize(
+    ("size", "grid"),
+    [
+        ((96, 128), Grid(12, 16, 8, 3.5)),
+        ((96, 128), Grid(12, 16, 8, 0.0)),  # as correspondence `droid` has it
+        ((100, 140), Grid(6, 9, 16, 7.5)),  # with pixels left over
+    ],
+)
+def test_cells_are_where_the_grid_puts_them(monkeypatch, size, grid) -> None:
+    classifier = MovableClassifier(find_weights(), CPU, (1.0,), information=True)
+
+    def where(log_p: torch.Tensor) -> torch.Tensor:
+        """Instead of evidence, the column of the picture that each place lies at."""
+        height, width = log_p.shape[2:]
+        column = (torch.arange(width) + 0.5) * size[1] / width - 0.5
+        return column.expand(1, 1, height, width)
+
+    monkeypatch.setattr(classifier, "_evidence", where)
+    found = classifier(torch.zeros(3, *size), grid)
+    column = torch.arange(grid.width) * grid.stride + grid.offset
+    inner = (column > 16) & (column < size[1] - 17)  # beyond, the outermost places are continued
+    gap = (found - column)[:, inner].abs()
+    assert float(gap.max()) < 1e-3

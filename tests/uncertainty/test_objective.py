@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from droidw.geometry import se3
 from droidw.geometry.projective import reproject
+from droidw.testing.pretend_gpu import PretendGpu
 from droidw_plugins.uncertainty import _objective as objective
 
 F64 = torch.float64
@@ -23,6 +25,12 @@ def _samples(coords: Tensor, valid: Tensor, ii: Tensor, jj: Tensor) -> objective
     """Samples of places [E,h,w,2], in the order that one writes them down."""
     xy = coords.flatten(1, 2).transpose(1, 2)
     return objective.make_samples(xy, valid.flatten(1), coords.shape[2], ii, jj)
+
+
+def _moved(samples: objective.Samples, device: str) -> objective.Samples:
+    """The same on another device."""
+    every = {f.name: getattr(samples, f.name) for f in fields(samples) if f.name != "steps"}
+    return replace(samples, **{name: value.to(device) for name, value in every.items()})
 
 
 def _corners(samples: objective.Samples) -> Tensor:
@@ -177,6 +185,21 @@ def test_similarity_is_the_cosine_with_the_interpolated_vector() -> None:
     )
     assert torch.allclose(found, expected, atol=1e-5)
     assert torch.allclose(objective.similarity(features * 9, samples), found, atol=1e-5)
+
+
+def test_similarity_on_a_gpu_in_groups_of_edges_is_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, _, samples = _problem(4)
+    features = torch.randn(3, 20, 7, generator=_generator(6), dtype=F64)
+    whole = objective.similarity(features, samples)
+    for together in (1, 60, 1000):  # an edge at a time, three and one, all of them
+        monkeypatch.setattr(objective, "_TOGETHER", together)
+        with PretendGpu():
+            there = features.to("cuda")
+            assert there.is_cuda
+            found = objective.similarity(there, _moved(samples, "cuda"))
+            torch.testing.assert_close(found.cpu(), whole, rtol=1e-9, atol=1e-9)
 
 
 def test_similarity_in_parts_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

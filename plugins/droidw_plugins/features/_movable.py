@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from droidw_plugins.features._efficientnet import BLOCKS, load_classifier
+from droidw_plugins.features._patches import sample_at_cells
 
 if TYPE_CHECKING:
     from droidw.geometry.camera import Grid
@@ -88,8 +89,11 @@ class MovableClassifier:
         large = F.interpolate(image[None], (height, width), mode="bilinear", align_corners=False)
         seen = F.relu6(self._head(self._trunk(large)[0]))
         share = self._evidence(self._classes(seen).log_softmax(1))
-        cells = (grid.height, grid.width)
-        return F.interpolate(share, cells, mode="bilinear", align_corners=False)[0, 0]
+        size = tuple(image.shape[1:])
+        if _even(grid, size):  # the same, in one call
+            cells = (grid.height, grid.width)
+            return F.interpolate(share, cells, mode="bilinear", align_corners=False)[0, 0]
+        return sample_at_cells(share[0], size, grid)[0]
 
     def _evidence(self, log_p: Tensor) -> Tensor:
         """Evidence [B,1,...] for classes that move, from logarithms of probabilities [B,n,...]."""
@@ -99,3 +103,9 @@ class MovableClassifier:
         most = math.log(log_p.shape[1])
         told: Tensor = (p * (log_p + most) * self._movable).sum(1, keepdim=True)
         return (told / most).clamp(0.0, 1.0)
+
+
+def _even(grid: Grid, size: tuple[int, ...]) -> bool:
+    """Whether cells part a picture of H, W evenly, each around its centre."""
+    covered = (grid.height * grid.stride, grid.width * grid.stride)
+    return covered == size and grid.offset == (grid.stride - 1) / 2

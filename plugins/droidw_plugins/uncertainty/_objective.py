@@ -46,6 +46,8 @@ EPSILON = 1e-6
 """Keeps the cosine of a feature that is zero, and the share of a frame without edges, finite."""
 # Feature values handled at a time on a CPU: the temporaries then stay in its cache.
 _CHUNK = 1 << 18
+# Cells of all edges that are compared at once on a GPU; bounds memory, not the result.
+_TOGETHER = 300_000
 
 
 @dataclass(frozen=True)
@@ -195,13 +197,19 @@ def similarity(features: Tensor, samples: Samples, lengths: Tensor | None = None
     first = samples.first.to(torch.int32)
     steps = on_device(samples.steps, features.device, torch.int32)
     if features.is_cuda:
-        # One launch for all edges, and the host need not know their sources.
         index, weight = first[:, None] + steps, samples.weights.T.contiguous()
-        met = F.embedding_bag(index, table, mode="sum", per_sample_weights=weight)
-        met = met.view(n_edges, cells, channels)
-        product = (met * features.index_select(0, samples.source)).sum(2)
-        length = lengths.index_select(0, samples.source) * torch.linalg.vector_norm(met, dim=2)
-        return product.div_(length.add_(EPSILON))
+        cosine = features.new_empty(n_edges, cells)
+        group = max(_TOGETHER // cells, 1)
+        for start in range(0, n_edges, group):
+            # One launch for all edges of a group, and the host need not know their sources.
+            some = slice(start, start + group)
+            rows = slice(start * cells, (start + group) * cells)
+            met = F.embedding_bag(index[rows], table, mode="sum", per_sample_weights=weight[rows])
+            met, source = met.view(-1, cells, channels), samples.source[some]
+            product = (met * features.index_select(0, source)).sum(2)
+            length = lengths.index_select(0, source) * torch.linalg.vector_norm(met, dim=2)
+            torch.div(product, length.add_(EPSILON), out=cosine[some])
+        return cosine
     ones = features.new_ones(channels)
     dot, square = features.new_empty(2, n_edges * cells).unbind()
     group = max(_CHUNK // (cells * channels), 1)
