@@ -9,7 +9,7 @@ import torch
 
 from droidw.errors import ConfigError, InputError
 from droidw.geometry.camera import Grid
-from droidw.interfaces.correspondence import Correspondence, EdgeSession
+from droidw.interfaces.correspondence import Correspondence, EdgeSession, Motion
 from droidw.slam.frame import Frame
 from droidw.testing.conformance import check
 from droidw_plugins.correspondence._droid import DroidCorrespondence
@@ -76,6 +76,28 @@ def test_motion_is_the_mean_correction_of_one_round(operator, frames, grid, net)
     other = part.motion(reference, part.encode(frames[3], grid))
     assert other.flow != found.flow
     assert part.motion(keyframe, current).flow == pytest.approx(found.flow)
+
+
+def test_what_a_mask_covers_does_not_tell_how_far_a_picture_moved(operator, frames, grid):
+    part = operator()
+    first, current = (part.encode(frames[k], grid) for k in (0, 2))
+    reference = part.context(first, frames[0], grid)
+    whole = part.motion(reference, current)
+    mask = torch.zeros(64, 96, dtype=torch.bool)
+    masked = replace(frames[2], mask=mask)
+    assert part.motion(reference, part.encode(masked, grid)).flow == pytest.approx(whole.flow)
+    mask[:, 48:] = True
+    half = part.encode(masked, grid)
+    assert torch.equal(half.fmap, current.fmap)
+    assert half.seen is not None and not half.seen[:, 6:].any() and half.seen[:, :4].all()
+    found = part.motion(reference, half)
+    assert found.flow != whole.flow and found.matched == 1.0
+    # the same from the other side, and of a keyframe
+    covered = replace(frames[0], mask=mask)
+    begun = part.context(part.encode(covered, grid), covered, grid)
+    assert part.motion(begun, current).flow == pytest.approx(found.flow)
+    mask[:] = True
+    assert part.motion(reference, part.encode(masked, grid)) == Motion(0.0, 0.0)
 
 
 def test_motion_from_a_frame_that_was_no_candidate(operator, frames, grid):

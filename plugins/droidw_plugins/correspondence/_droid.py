@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -13,6 +13,7 @@ from droidw.errors import ConfigError, InputError
 from droidw.geometry.projective import pixel_grid
 from droidw.geometry.transfer import upload
 from droidw.interfaces.correspondence import Motion, Purpose
+from droidw.solve.weights import unmasked
 from droidw_plugins.correspondence._droid_corr import Pyramid, lookup_lowmem, smallest_side
 from droidw_plugins.correspondence._droid_session import DroidSession
 
@@ -30,10 +31,16 @@ STRIDE = 8
 
 @dataclass(frozen=True, eq=False)
 class DroidFrame:
-    """Payload of any frame: features [128,h,w] in the precision of the store."""
+    """Payload of any frame.
+
+    Attributes:
+        fmap: features [128,h,w] in the precision of the store.
+        seen: bool [h,w], cells that the frame's mask leaves; None: all of them.
+    """
 
     index: int
     fmap: Tensor
+    seen: Tensor | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +116,10 @@ class DroidCorrespondence:
         _check_size(height, width)
         with self.computing():
             features = self.net.features(self._image(frame))
-        return DroidFrame(frame.index, features[0].to(self.stored).contiguous())
+        seen = None
+        if frame.mask is not None:
+            seen = unmasked(grid.covered(upload(frame.mask, self.device))) > 0
+        return DroidFrame(frame.index, features[0].to(self.stored).contiguous(), seen=seen)
 
     @torch.no_grad()
     def context(self, payload: DroidFrame, frame: Frame, grid: Grid) -> DroidKeyframe:
@@ -117,20 +127,21 @@ class DroidCorrespondence:
         with self.computing():
             net, inp = self.net.context(self._image(frame))
         net, inp = (x[0].to(self.stored).contiguous() for x in (net, inp))
-        keyframe = DroidKeyframe(payload.index, payload.fmap, net, inp)
+        keyframe = DroidKeyframe(payload.index, payload.fmap, net, inp, seen=payload.seen)
         self._latest = keyframe
         first, self._first = self._first, False
         if first and self.published:
             # The published code stores one channel here, which then stands for all 128.
             net, inp = (x[:1].expand_as(x) for x in (net, inp))
-            return DroidKeyframe(payload.index, payload.fmap, net, inp)
+            return replace(keyframe, net=net, inp=inp)
         return keyframe
 
     @torch.no_grad()
     def motion(self, reference: DroidFrame, current: DroidFrame) -> Motion:
         """Mean flow of one round of the update operator on the pair (REFERENCE 5.1).
 
-        The network does not say what it could match: `matched` is 1.
+        Cells that the mask of either picture covers have no say in it. The network does not say
+        what it could match: `matched` is 1, or 0 where nothing is left.
 
         Raises:
             ValueError: `context` was never asked for `reference`.
@@ -147,7 +158,13 @@ class DroidCorrespondence:
                 net, inp = (self.working(x)[None] for x in (keyframe.net, keyframe.inp))
                 self._still = keyframe, update.still(_last(net), _last(inp))
             delta = update.drift(self._still[1], corr)
-        return Motion(float(delta.norm(dim=-1).mean()), 1.0)
+        length = delta.norm(dim=-1)
+        seen = [mask for mask in (reference.seen, current.seen) if mask is not None]
+        if not seen:
+            return Motion(float(length.mean()), 1.0)
+        left = torch.stack(seen).all(0)
+        moved, count = torch.stack([(length * left).sum(), left.sum().to(length)]).tolist()
+        return Motion(moved / max(count, 1.0), min(count, 1.0))
 
     def session(self, purpose: Purpose = "window") -> DroidSession:
         """Fresh hidden states; "global" keeps no correlation, "fill" gives no damping."""
