@@ -109,9 +109,13 @@ def test_moving_the_picture_moves_the_features() -> None:
 def test_first_picture_fixes_the_calibration_and_state_restores_it() -> None:
     extractor = _build()
     blank = torch.full((3, 64, 80), 0.5)
-    extractor.extract(blank, GRID)
+    nothing = extractor.extract(blank, GRID)
     assert extractor.state_dict() == {}  # nothing is learned from a blank picture
     first = extractor.extract(_picture(1), GRID)
+    # and it is neither like nor unlike what comes later
+    cosine = torch.nn.functional.cosine_similarity(nothing, first, dim=0)
+    assert nothing.shape == first.shape
+    assert float(cosine.min()) > 0.6
     state = extractor.state_dict()
     extractor.extract(_picture(2), GRID)
     assert torch.equal(extractor.state_dict()["matrix"], state["matrix"])
@@ -136,11 +140,12 @@ def test_constant_is_an_affine_map_of_the_cosine() -> None:
     plain = _build(calibration="weights", constant=0.0, length=1.0)
     raised = _build(calibration="weights", constant=constant, length=1.0)
     image = _picture(7)
+    assert plain._fixed is not None and raised._fixed is not None
     taps = plain._taps(image, GRID)
-    a = plain._default(torch.cat(taps)).flatten(1)
-    b = raised._default(torch.cat(taps)).flatten(1)
-    centred = torch.cat(taps).flatten(1) - plain._default.mean[:, None]
-    n = (plain._default.matrix @ centred).norm(dim=0)
+    a = plain._fixed(torch.cat(taps)).flatten(1)
+    b = raised._fixed(torch.cat(taps)).flatten(1)
+    centred = torch.cat(taps).flatten(1) - plain._fixed.mean[:, None]
+    n = (plain._fixed.matrix @ centred).norm(dim=0)
     i, j = torch.arange(40), torch.arange(40, 80)
     cosine = (a[:, i] * a[:, j]).sum(0)
     expected = (cosine * n[i] * n[j] + constant**2) / (

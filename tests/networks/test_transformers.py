@@ -209,9 +209,12 @@ def test_calibration_from_the_first_picture(extractor):
     grid = Grid.of(112, 140, 8, 3.5)
     picture = torch.rand(3, 112, 140, generator=torch.Generator().manual_seed(6))
     part = extractor("fit3d", calibration="picture", dtype="float32")
-    part.extract(torch.full_like(picture, 0.5), grid)
+    nothing = part.extract(torch.full_like(picture, 0.5), grid)
     assert part.state_dict() == {}  # nothing is learned from a blank picture
     found = part.extract(picture, grid)
+    # and it is neither like nor unlike what comes later
+    cosine = F.cosine_similarity(nothing, found, dim=0)
+    assert nothing.shape == found.shape and float(cosine.std()) < 0.1 and cosine.min() > 0.5
     assert part.dim == found.shape[0] == 385
     assert torch.allclose(found.norm(dim=0), torch.ones(grid.height, grid.width), atol=1e-4)
     other = extractor("fit3d", calibration="picture", dtype="float32")

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from droidw_plugins.features._efficientnet import ChannelStatistics
 
-__all__ = ["Calibration", "from_picture", "from_weights", "is_blank"]
+__all__ = ["Calibration", "from_picture", "from_weights", "is_blank", "of_nothing"]
 
 _BLANK = 0.02  # standard deviation of the strongest colour channel
 
@@ -49,6 +49,18 @@ class Calibration:
     def state_dict(self) -> dict[str, Any]:
         """What depends on the picture: `matrix` and `mean`."""
         return {"matrix": self.matrix, "mean": self.mean}
+
+
+def of_nothing(like: Tensor, constant: float, length: float) -> Tensor:
+    """Features [D,h,w] of a picture that shows nothing, in the space of `like` [D,h,w].
+
+    They are those of a cell that is the mean of all, but for the constant channel, if there is one:
+    whatever follows is as near to them as to anything else.
+    """
+    found = torch.zeros_like(like)
+    if constant > 0:
+        found[-1] = length
+    return found
 
 
 def is_blank(image: Tensor) -> bool:

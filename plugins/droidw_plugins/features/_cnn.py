@@ -17,6 +17,7 @@ from droidw_plugins.features._calibration import (
     from_picture,
     from_weights,
     is_blank,
+    of_nothing,
 )
 from droidw_plugins.features._efficientnet import CENTRES, FINE, load_trunk
 from droidw_plugins.features._movable import MovableClassifier
@@ -95,16 +96,15 @@ class CnnFeatures:
         self.dtype: torch.dtype = getattr(torch, options.dtype)
         self.calibrated = options.calibration == "picture"
         self._fixed: Calibration | None = None
-        self._default = from_weights(
-            self._trunk.statistics,
-            self._shares,
-            options.calibration != "none",
-            options.constant,
-            options.length,
-            self._rows,
-        )
-        if options.calibration != "picture":
-            self._fixed = self._default
+        if not self.calibrated:
+            self._fixed = from_weights(
+                self._trunk.statistics,
+                self._shares,
+                options.calibration != "none",
+                options.constant,
+                options.length,
+                self._rows,
+            )
 
     @torch.no_grad()
     def extract(self, image: Tensor, grid: Grid) -> Tensor:
@@ -116,18 +116,19 @@ class CnnFeatures:
         statistics = self._trunk.statistics
         calibration = self._fixed
         if calibration is None:
-            calibration = self._default
-            if not is_blank(image):
-                options = self._options
-                calibration = self._fixed = from_picture(
-                    taps,
-                    statistics,
-                    self._shares,
-                    options.shrinkage,
-                    self._rows,
-                    options.constant,
-                    options.length,
-                )
+            options = self._options
+            if is_blank(image):
+                blank = taps[0].new_empty(self.dim, grid.height, grid.width, dtype=self.dtype)
+                return of_nothing(blank, options.constant, options.length)
+            calibration = self._fixed = from_picture(
+                taps,
+                statistics,
+                self._shares,
+                options.shrinkage,
+                self._rows,
+                options.constant,
+                options.length,
+            )
         return calibration(torch.cat(taps)).to(self.dtype)
 
     def movable(self, image: Tensor, grid: Grid) -> Tensor:

@@ -17,7 +17,7 @@ from droidw.plugin.weights import WeightsFile
 from droidw_plugins._vit.layers import choose_dtype, exact
 from droidw_plugins._vit.model import PATCH
 from droidw_plugins._vit.published import blaming, load_transformer, read_published
-from droidw_plugins.features._calibration import Calibration, from_picture, is_blank
+from droidw_plugins.features._calibration import Calibration, from_picture, is_blank, of_nothing
 from droidw_plugins.features._efficientnet import ChannelStatistics
 from droidw_plugins.features._patch_options import PatchOptions
 
@@ -120,9 +120,12 @@ class PatchFeatures:
     def _calibrated(self, features: Tensor, image: Tensor) -> Tensor:
         calibration = self._calibration
         if calibration is None:
+            if is_blank(image):
+                like = features.new_empty(self.dim, *features.shape[1:])
+                return of_nothing(like, self._options.constant, 1.0)
             flat = features.flatten(1)
             spread = ChannelStatistics(flat.mean(1), flat.std(1).clamp_min(1e-3))
-            calibration = from_picture(
+            calibration = self._calibration = from_picture(
                 [features],
                 [spread],
                 (1.0,),
@@ -131,8 +134,6 @@ class PatchFeatures:
                 self._options.constant,
                 1.0,
             )
-            if not is_blank(image):
-                self._calibration = calibration
         return calibration(features)
 
 
