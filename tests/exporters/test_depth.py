@@ -8,12 +8,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from droidw.errors import UsageError
 from droidw.geometry.camera import Grid
 from droidw.interfaces.exporters import Exporter
+from droidw.slam.frame import Frame
 from droidw.testing._check_files import sample_result
 from droidw.testing.conformance import check_exporter
+from droidw_plugins.depth._folder import FileDepth
+from droidw_plugins.depth.file import FileDepthOptions
 from droidw_plugins.exporters import depth
 
 
@@ -67,6 +71,24 @@ def test_pictures(result, tmp_path, everything):
         np.testing.assert_allclose(
             (read * facts["scale"])[shown], exact[shown], atol=0.501 * facts["scale"]
         )
+
+
+@pytest.mark.parametrize("metric", [False, True])
+def test_depth_prior_file_takes_what_was_written(result, tmp_path, metric):
+    scale = "metric, from the depth prior" if metric else "arbitrary"
+    depth.DepthExporter().export(replace(result, manifest={"scale": scale}), tmp_path)
+    prior = FileDepth(FileDepthOptions(path=str(tmp_path / "depth")))
+    assert (prior.available, prior.metric) == (3, metric)
+    rows, columns = result.keyframes[0].disp.shape
+    for keyframe in result.keyframes:
+        image, none = torch.zeros(3, rows, columns), torch.zeros(4)
+        found = prior.predict(Frame(keyframe.index, 0.0, image, none, f"{keyframe.index + 1}.jpg"))
+        assert found is not None
+        exact, known = truth(keyframe)
+        shown = known & keyframe.depth_valid
+        np.testing.assert_array_equal(found.depth.numpy() > 0, shown)
+        np.testing.assert_allclose(found.depth.numpy()[shown], exact[shown], rtol=2e-3)
+    assert prior.predict(Frame(1, 0.0, image, none, "000000.png")) is None
 
 
 def test_numbers(result, tmp_path):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import math
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 from zipfile import BadZipFile
 
 import cv2
@@ -18,8 +19,8 @@ import torch
 from droidw.errors import ConfigError, InputError
 from droidw.interfaces.depth import DepthMap
 from droidw.io.listing import without_remark
-from droidw.io.masks import seconds_in_names
-from droidw_plugins.depth._lookup import Lookup
+from droidw.io.masks import numbers_in_names, seconds_in_names, written_by_droidw
+from droidw_plugins.depth._lookup import Lookup, Rule
 from droidw_plugins.depth.file import FileDepthOptions
 
 if TYPE_CHECKING:
@@ -36,12 +37,14 @@ _log = logging.getLogger(__name__)
 class FileDepth:
     """Depth maps of a folder, found by time, by file name or by position of the frame: `Lookup`.
 
-    A frame without a map gets none; `found` and `missing` count what was asked for.
+    Maps that droidw wrote (`scale.json` beside them says so) are found by index, have the scale and
+    unit that is said there, and are not metric where it was not. A frame without a map gets none;
+    `found` and `missing` count what was asked for.
 
     Args:
         options: see `FileDepthOptions`.
     Attributes:
-        metric: as the options say.
+        metric: as the options say, and what droidw says of maps of its own.
         available: number of maps. found, missing: frames asked for, with and without a map.
     Raises:
         ConfigError: no path is given, or `match="time"` where no times are known.
@@ -70,7 +73,16 @@ class FileDepth:
                 f"give the folder that holds the maps: depth.options.path={folder}",
             )
         times: list[float] = []
-        if listing.is_file():
+        own = None if listing.is_file() else _own(folder)
+        self._scale = options.scale or _MILLIMETRES
+        if own is not None:
+            numbers = numbers_in_names([f for f in folder.iterdir() if f.suffix == ".png"])
+            self._files = [numbers[number] for number in sorted(numbers)]
+            self._scale = options.scale or 1.0 / own.scale
+            if options.metric and not own.metric:
+                self.metric = False
+                _log.info("%s: droidw wrote these maps, in scene units", folder)
+        elif listing.is_file():
             times, self._files = _read_list(listing)
         else:
             found = (f for f in folder.iterdir() if f.suffix.lower() in _SUFFIXES)
@@ -86,7 +98,9 @@ class FileDepth:
                 "line, or names that are seconds",
                 "or choose depth.options.match=name or =index",
             )
-        rule = None if options.match == "auto" else options.match
+        rule: Rule | None = None if options.match == "auto" else options.match
+        if own is not None:
+            rule = "index"
         self._lookup = Lookup(self._files, times, rule, options.max_time_gap)
         self.available = len(self._files)
         self.found = 0
@@ -115,7 +129,7 @@ class FileDepth:
                 )
             return None
         self.found += 1
-        depth = read_depth(file, self._options.scale or _MILLIMETRES)
+        depth = read_depth(file, self._scale)
         if self._options.max_depth > 0:
             depth[depth > self._options.max_depth] = 0.0
         height, width = frame.image.shape[-2:]
@@ -124,6 +138,26 @@ class FileDepth:
             columns = (np.arange(width) * 2 + 1) * depth.shape[1] // (2 * width)
             depth = depth[rows[:, None], columns]
         return DepthMap(torch.from_numpy(depth).to(frame.image.device))
+
+
+class _Own(NamedTuple):
+    """What `scale.json` of exporter `depth` says: depth per value, and whether it is in metres."""
+
+    scale: float
+    metric: bool
+
+
+def _own(folder: Path) -> _Own | None:
+    """What droidw says of maps that it wrote, named by the index of the frame; None of others."""
+    says = folder.parent if folder.name == "full" else folder
+    if not written_by_droidw(says):
+        return None
+    try:
+        facts = json.loads((says / "scale.json").read_text(encoding="utf-8"))
+        own = _Own(float(facts["scale"]), facts["unit"] == "metres")
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return own if math.isfinite(own.scale) and own.scale > 0 else None
 
 
 def read_depth(file: Path, scale: float) -> npt.NDArray[np.float32]:

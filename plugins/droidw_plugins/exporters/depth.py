@@ -149,9 +149,13 @@ class DepthExporter:
             path = folder / f"{keyframe.index:06d}.png"
             write_map(path, values)
             written.append(path)
+        metric = str(result.manifest.get("scale", "")).startswith("metric")
+        unit = "metres" if metric else "scene units"
         facts: dict[str, Any] = {
-            "depth": "value * scale, along the optical axis, in scene units; 0 is unknown",
+            "depth": f"value * scale, along the optical axis, in {unit}; 0 is unknown",
             "scale": scale,
+            "unit": unit,
+            "named": "index",
             "unconfirmed": "written" if self._all else "0",
             "median_depth": float(np.median(depth[keep])) if keep.any() else None,
             "cells_too_far": too_far,
