@@ -137,12 +137,13 @@ def _why(code: int, folder: Path, seconds: float) -> str:
     if code == -int(signal.SIGALRM):
         return f"took longer than it may (--limit), ended after {seconds:.0f} s"
     if code < 0:
-        name = signal.Signals(-code).name
+        known = {int(number): number.name for number in signal.Signals}
+        name = known.get(-code, f"signal {-code}")
         hint = ": is memory short?" if name == "SIGKILL" else ""
         return f"its process was ended by {name}{hint}"
     text = (folder / "output.txt").read_text(encoding="utf-8", errors="replace")
     _, found, rest = text.rpartition("droidw: error: ")
-    if found:
+    if found and rest.strip():
         return rest.splitlines()[0]
     lines = [line for line in text.splitlines() if line.strip()]
     last = f": {lines[-1]}" if lines else ""

@@ -146,11 +146,17 @@ def _run(
                 code, seconds = get(reference)
             except exceptions.RayTaskError as error:
                 cause = getattr(error, "cause", None) or error
-                why = f"{type(cause).__name__}: {str(cause).splitlines()[0]}"
+                why = f"{type(cause).__name__}{_first_line(cause)}"
                 outcome = conclude(folder, 1, 0.0, f"its task failed: {why}")
             except exceptions.RayError as error:
-                lost = f"its worker was lost {RETRIES + 1} times: {str(error).splitlines()[0]}"
+                lost = f"its worker was lost {RETRIES + 1} times{_first_line(error)}"
                 outcome = conclude(folder, 1, 0.0, lost)
             else:
                 outcome = conclude(folder, code, seconds)
             tell(cell, "failed" if outcome.error else "done", outcome)
+
+
+def _first_line(error: BaseException) -> str:
+    """A colon and the first line of what an error says; nothing where it says nothing."""
+    lines = [line for line in str(error).splitlines() if line.strip()]
+    return f": {lines[0]}" if lines else ""

@@ -143,8 +143,9 @@ class Table:
     def remarks(self) -> list[tuple[str, str]]:
         """What is to be known of figures: (column, sequence or cell, a sentence), in this order.
 
-        Columns that no cell has, sequences of which no cell has a result, and what runs with a
-        result were warned of and measuring noted.
+        Columns that no cell has, sequences of which no cell has a result, in what else than their
+        configuration cells with a result differ, and what their runs were warned of and measuring
+        noted.
         """
         shown = {column.key for column in self.columns}
         found = [(key, "no cell has this figure") for key in self.plan.columns if key not in shown]
@@ -154,12 +155,29 @@ class Table:
             for name in self.plan.sequences
             if known and name not in known
         ]
+        found += [
+            ("cells", f"they differ in what made them, {key}: {', '.join(values)}")
+            for key, values in self._made_with()
+            if len(values) > 1
+        ]
         for cell, outcome in self.cells:
             if outcome is None or outcome.error:
                 continue
             said = [*outcome.facts.get("warnings", ()), *outcome.facts.get("notes", ())]
             found += [(cell.name, str(sentence)) for sentence in dict.fromkeys(said)]
         return found
+
+    def _made_with(self) -> list[tuple[str, list[str]]]:
+        """Versions of packages and machines, and those that cells have: kept cells may be old."""
+        made: dict[str, list[str]] = {}
+        for _, outcome in self.cells:
+            if outcome is None or outcome.error:
+                continue
+            for key, value in dict(outcome.facts.get("versions", {})).items():
+                known = made.setdefault(str(key), [])
+                if str(value) not in known:
+                    known.append(str(value))
+        return list(made.items())
 
     def grid(self, column: Column) -> list[list[str]]:
         """Rows of text: a head, then each row with every sequence, the mean and the ratio."""

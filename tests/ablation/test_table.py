@@ -130,6 +130,17 @@ def test_what_is_to_be_known_of_figures():
     assert "it &lt;blinks&gt;" in make_page(known)
 
 
+def test_cells_of_other_versions_are_told():
+    known = table({("full", "a"): [1.0, 2.0, "lost"]})
+    made = []
+    for (cell, outcome), torch in zip(known.cells, ("2.13.0", "2.14.1", "2.9.0"), strict=True):
+        facts = {"versions": {"droidw": "0.1.0", "torch": torch}}
+        made.append((cell, replace(outcome, facts=facts)))
+    assert replace(known, cells=tuple(made)).remarks() == [
+        ("cells", "they differ in what made them, torch: 2.13.0, 2.14.1")
+    ]
+
+
 def test_csv_has_every_cell_and_every_figure():
     rows = list(csv.DictReader(io.StringIO(comma_separated(FULL))))
     assert len(rows) == 18
