@@ -9,14 +9,13 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 
-from droidw.geometry.projective import frame_distance
 from droidw.geometry.transfer import upload
 from droidw.graph.factors import FactorGraph
 from droidw.graph.proximity import backend_edges, frontend_edges
 from droidw.interfaces.correspondence import Upsamples
+from droidw.slam.apart import distances_between
 from droidw.slam.between import inherited
 from droidw.slam.convergence import moved_by
 from droidw.slam.doubt import Link, explained_share, weakest_link
@@ -39,9 +38,6 @@ if TYPE_CHECKING:
 __all__ = ["Backend"]
 
 _log = logging.getLogger(__name__)
-
-# Pairs whose distance is computed at once; bounds memory, not the result.
-_CHUNK = 2048
 
 
 class Backend:
@@ -317,25 +313,8 @@ class Backend:
         if more:
             nms, factors = min(nms, options.last_nms), max(factors, options.last_factors)
         old = list(range(len(store))) if self._between is None else self._between.old()
-        at = torch.tensor(old, dtype=torch.int64)
-        count = len(old)
-        ii, jj = torch.tril_indices(count, count, -1)
-        near = []
-        for start in range(0, len(ii), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            near.append(
-                frame_distance(
-                    store.T_cw,
-                    store.disps,
-                    store.intrinsics,
-                    upload(at[ii[part]], store.device),
-                    upload(at[jj[part]], store.device),
-                    options.beta,
-                ).cpu()
-            )
-        distance = np.full((count, count), np.inf)
-        distance[ii.numpy(), jj.numpy()] = torch.cat(near).double().numpy()
-        there = upload(at, store.device)
+        distance = distances_between(store, old, options.beta)
+        there = upload(torch.tensor(old, dtype=torch.int64), store.device)
         hidden = store["movable"][there], store["unmasked"][there]
         steps = spans(*hidden, self.config.motion_filter)
         # where keyframes are near to one another, more of them are as far apart as elsewhere
@@ -350,4 +329,4 @@ class Backend:
             max_factors=most,
             spans=steps,
         )
-        return found if count == len(store) else inherited(found, old, len(store))
+        return found if len(old) == len(store) else inherited(found, old, len(store))
