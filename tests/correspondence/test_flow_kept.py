@@ -143,6 +143,23 @@ def test_what_is_given_up_does_not_depend_on_which_thread_was_first(order):
     assert [kept.get(key) for key in "bcd"] == ["anew", None, "d"]
 
 
+@pytest.mark.parametrize("order", [(4, 2, 3, 1), (1, 2, 3, 4)])
+def test_of_more_than_there_is_room_for_the_next_round_finds_the_first(order):
+    kept = KeptInRounds(2)
+    for _ in range(2):
+        kept.begin(order)
+        found = [key for key in order if kept.get(key) is not None]
+        for key in order:
+            kept.put(key, key)
+        kept.settle()
+    assert sorted(found) == [1, 2]
+    assert [kept.get(key) for key in (1, 2, 3, 4)] == [1, 2, None, None]
+    kept.begin([5])
+    kept.put(5, 5)
+    kept.settle()
+    assert [kept.get(key) for key in (1, 2, 5)] == [None, 2, 5]
+
+
 def test_a_direction_that_is_not_wanted_sets_out_from_its_prediction(operator, pair, monkeypatch):
     part = operator()
     a, b = pair(part)

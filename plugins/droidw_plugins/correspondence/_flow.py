@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -365,6 +365,12 @@ class FlowCorrespondence:
         if a.bridged is None and b.bridged is None:
             return self._free(a, b)
         return self._search(a, b, None, fine)
+
+    def begin(self, pairs: Iterable[tuple[FlowFrame, FlowFrame, bool]], fine: bool) -> None:
+        """Begin a round of searches `both_ways`: of these frames, and whether they are seeded."""
+        asked = [(a.key, b.key, fine, seeded) for a, b, seeded in pairs]
+        self._pairs.begin(asked)
+        self._plain.begin([key[:3] for key in asked])
 
     def settle(self) -> None:
         """End a round of searches: pairs of long ago are given up."""

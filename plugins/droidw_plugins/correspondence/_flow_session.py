@@ -133,6 +133,8 @@ class FlowSession:
         def start(row: int | None) -> Array | None:
             return None if row is None else known[row]
 
+        asked: list[tuple[FlowFrame, FlowFrame, bool]] = []
+
         def job(key: tuple[int, int]) -> Callable[[], Any]:
             a, b = request.payload(key[0]), request.payload(key[1])
             starts = start(predicted.get(key)), start(predicted.get(key[::-1]))
@@ -140,11 +142,14 @@ class FlowSession:
             seeded = options.seeds > 0 and (
                 request.doubtful or min(f.held for f in without) < options.seeds_below
             )
+            asked.append((a, b, seeded))
             return lambda: self._owner.both_ways(
                 a, b, *starts, self._fine, bridged=without, seeded=seeded
             )
 
-        measured = self._owner.map([job(key) for key in pairs])
+        jobs = [job(key) for key in pairs]
+        self._owner.begin(asked, self._fine)
+        measured = self._owner.map(jobs)
         self._owner.settle()
         for rows, both in zip(pairs.values(), measured, strict=True):
             for forward, row in rows.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import zlib
 from collections import OrderedDict
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Generic, TypeVar
@@ -201,18 +201,26 @@ class KeptInRounds(Kept[Key, Value]):
     """The same where values depend on more than their keys: which are given up shows in results.
 
     Threads of one round end in any order. So values are given up between rounds alone, and those of
-    one round in the order of their keys.
+    one round in the order of their keys. A round of more than there is room for keeps the first of
+    them, so that the next one like it finds these.
     """
 
     def __init__(self, most: int) -> None:
         super().__init__(most)
         self._fresh: set[Key] = set()
+        self._room: set[Key] | None = None
+
+    def begin(self, keys: Iterable[Key]) -> None:
+        """Begin a round in which values of these keys are put."""
+        ordered = sorted(keys, key=repr)
+        self._room = set(ordered[: self._most]) if len(ordered) > self._most else None
 
     def put(self, key: Key, value: Value) -> None:
-        """Keep a value, however many there are, till the round is over."""
+        """Keep a value till the round is over, if there is room for it."""
         with self._lock:
-            self._values[key] = value
-            self._fresh.add(key)
+            if self._room is None or key in self._room:
+                self._values[key] = value
+                self._fresh.add(key)
 
     def settle(self) -> None:
         """End a round: nothing is put meanwhile."""
@@ -220,6 +228,7 @@ class KeptInRounds(Kept[Key, Value]):
             for key in sorted(self._fresh, key=repr):
                 self._values.move_to_end(key)
             self._fresh.clear()
+            self._room = None
             self._give_up()
 
 
