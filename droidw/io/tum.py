@@ -18,6 +18,8 @@ __all__ = ["read_tum", "write_tum"]
 _HEADER = "# timestamp tx ty tz qx qy qz qw (seconds, camera to world, OpenCV axes)\n"
 _VALID = "a row is `timestamp tx ty tz qx qy qz qw`, camera to world, times strictly rising"
 _SHOWN = 5
+# So many rows, and this share of them, may be out of the order of time and still be single strays.
+_FEW, _STRAYS = 3, 0.1
 
 
 def read_tum(path: Path | str, *, problems: list[str] | None = None) -> Trajectory:
@@ -28,7 +30,9 @@ def read_tum(path: Path | str, *, problems: list[str] | None = None) -> Trajecto
     Args:
         path: the file.
         problems: None to refuse a bad row; a list to skip bad rows, each with a sentence
-            appended (the first few alone, the rest counted).
+            appended (the first few alone, the rest counted). Single stray times are bad rows;
+            where more than a tenth of the rows would be (and than three), they are in another
+            order, and are put in that of time.
     Raises:
         InputError: the file is missing or no text, a row is bad (with its line number), or no
             row is left.
@@ -51,6 +55,11 @@ def read_tum(path: Path | str, *, problems: list[str] | None = None) -> Trajecto
             read.append((number, row))
     # One stray time costs no other row.
     kept = rising([row[0] for _, row in read])
+    times = len({row[0] for _, row in read})
+    if problems is not None and times - len(kept) > max(_FEW, _STRAYS * times):
+        problems.append(f"{path.name}: rows are not in the order of time; put in that order")
+        read.sort(key=lambda numbered: numbered[1][0])
+        kept = rising([row[0] for _, row in read])
     rows = [read[k][1] for k in kept]
     if problems is not None:
         bad += _strays(read, kept)

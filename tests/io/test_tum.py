@@ -155,3 +155,23 @@ def test_one_stray_time_costs_no_other_row(tmp_path):
     assert "repeats" in problems[1]
     with pytest.raises(InputError, match=r"line 7: time stamp 0\.5 runs backwards from 99999"):
         read_tum(file)
+
+
+@pytest.mark.parametrize("order", ["backwards", "pieces", "mixed"])
+def test_rows_in_another_order_are_put_in_that_of_time(tmp_path, order):
+    rows = [f"{t / 10} {t} 0 0 0 0 0 1" for t in range(40)]
+    written = {
+        "backwards": rows[::-1],
+        "pieces": rows[25:] + rows[:25] + rows[30:31],
+        "mixed": rows[::2] + rows[1::2],
+    }[order]
+    file = tmp_path / "other.tum"
+    file.write_text("\n".join(written) + "\n")
+    problems: list[str] = []
+    found = read_tum(file, problems=problems)
+    assert found.times.tolist() == [t / 10 for t in range(40)]
+    assert found.T_wc[:, 0].tolist() == list(range(40))
+    assert problems[0] == "other.tum: rows are not in the order of time; put in that order"
+    assert len(problems) == (2 if order == "pieces" else 1)  # and one is there twice
+    with pytest.raises(InputError, match="runs backwards"):
+        read_tum(file)
