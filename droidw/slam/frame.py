@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
 __all__ = ["CloudPoints", "Frame", "KeyframeRecord", "RawFrame", "RunResult", "Trajectory"]
 
+# Standard deviation of the strongest colour channel of a picture below which it shows nothing.
+_BLANK = 0.02
+
 
 @dataclass(frozen=True)
 class RawFrame:
@@ -53,6 +56,12 @@ class Frame:
     intrinsics: Tensor
     name: str = ""
     mask: Tensor | None = None
+
+    @property
+    def is_blank(self) -> bool:
+        """Whether the picture shows next to nothing: black, a cap on the lens."""
+        image = self.image
+        return image.numel() > 0 and float(image.flatten(1).std(1).max()) < _BLANK
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ class Verdict:
     Attributes:
         keep: make it a keyframe.
         forced: `force_every` frames have passed since the last keyframe; it is to stay.
-        motion: measured against the reference; None for the first frame.
+        motion: measured against the reference; None for the first one.
     """
 
     keep: bool
@@ -98,8 +98,14 @@ class MotionFilter:
         self._lost = 0
 
     def judge(self, current: Encoded) -> Verdict:
-        """Whether `current` becomes a keyframe; if so it is the reference from now on."""
+        """Whether `current` becomes a keyframe; if so it is the reference from now on.
+
+        The first is one that shows something: nothing could be matched with a blank one, and all
+        poses would hang on it.
+        """
         self._judged += 1
+        if self._reference is None and current.frame.is_blank:
+            return Verdict(keep=False, forced=False, motion=Motion(0.0, 0.0))
         if self._reference is None:
             self._accept(current, forced=True)
             return Verdict(keep=True, forced=False, motion=None)

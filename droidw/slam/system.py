@@ -279,6 +279,7 @@ class SlamSystem:
         found = diagnose(
             self.store, self._moved, self._matched, self.config.motion_filter.lost_below
         )
+        found = replace(found, frames=self.frames)
         if found.still:
             self._hold_still()
         elif not brief:
@@ -324,7 +325,8 @@ class SlamSystem:
         if self._newest is not None:
             current, verdict = self._newest
             self._newest = None
-            if self._filter.ends(verdict, self.store.infos[-1].index):
+            none = len(self.store) == 0  # all of them were blank
+            if none or self._filter.ends(verdict, self.store.infos[-1].index):
                 self._keyframe(self._with_movable(self._with_context(current)), forced=True)
 
     def _between(self, reread: Callable[[], Iterable[Frame]]) -> Between:

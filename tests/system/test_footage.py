@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from droidw.io.tum import read_tum
+
 
 def write_video(path, images):
     """An MP4 with its index in front, as phones upload it, so that a cut one can be opened."""
@@ -183,6 +185,12 @@ def test_blank_at_an_end(go, footage, blank):
     ran = go(clip.folder)
     assert ran.code == 0, ran.err
     assert len(ran.poses) == len(clip.times)
+    keyframes = read_tum(ran.folder / "keyframes.tum").times
+    assert not set(np.round(keyframes, 6)) & set(np.round(np.asarray(clip.times)[list(blank)], 6))
+    # nothing hangs on pictures that show nothing: they are where the path begins or ends
+    steps = np.linalg.norm(np.diff(ran.poses[:, 1:4], axis=0), axis=1)
+    hidden = steps[:3] if blank[0] == 0 else steps[-3:]
+    assert hidden.max() <= steps.max() and hidden.sum() < 0.3 * steps.sum()
 
 
 def test_pure_rotation(go, footage, rendered):
