@@ -192,6 +192,9 @@ def _refuse_taken(layers: Sequence[Layer], footage: Footage) -> None:
         "input.source": "each cell has that of its sequence: `sequences` in the file, --sequences",
     }
     for where, tree in layers:
+        given = tree.get("input")
+        if given is not None and not isinstance(given, Mapping):
+            raise ConfigError(f"{where}: input: {given!r} is no section", "e.g. input: {skip: 3}")
         for key, hint in hints.items():
             part: Any = tree
             for name in key.split("."):

@@ -85,6 +85,7 @@ def conclude(folder: Path, code: int, seconds: float, why: str = "") -> Outcome:
     if code == 0 and result.is_file():
         record = json.loads(result.read_text(encoding="utf-8"))
         return Outcome(record["metrics"], record["facts"], record["curve"], seconds=seconds)
+    result.unlink(missing_ok=True)  # else the cell would be finished the next time
     why = why or _why(code, folder, seconds)
     outcome = Outcome({}, {}, {}, why, max(code, 0) or 1, seconds)
     write_json(folder / "failure.json", {"error": outcome.error, "code": code, "seconds": seconds})

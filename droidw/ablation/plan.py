@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,8 @@ __all__ = ["Footage", "Layer", "Measuring", "Plan", "load_plan"]
 Layer = tuple[str, Mapping[str, Any]]
 """Where a part of a configuration was written, and that part."""
 
+# Of `vary`: what a cell is made from is no number.
+_NO_NUMBERS = ("input", "input.source")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
 _KEYS = (
     "title", "preset", "config", "base", "data", "sequences", "seeds", "vary", "rows",
@@ -190,6 +193,9 @@ def _sequences(reader: _Reader, data: Path | None, chosen: Sequence[str]) -> dic
         rest = {key: value for key, value in tree.items() if key not in ("source", "vary")}
         full = f"sequences.{name}.vary" if "vary" in tree else "vary"
         vary = tuple(reader.names(tree.get("vary", reader.tree.get("vary", [])), full))
+        for key in vary:
+            if key in _NO_NUMBERS:
+                raise reader.wrong(full, f"{key!r} cannot be set to a seed", "e.g. input.skip")
         found[_folder_name(name, found)] = Footage(source, (where, rest), vary)
     return found
 
@@ -286,6 +292,6 @@ class _Reader:
                 )
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
             whole = name != "masks_after" or isinstance(value, int)
-            if name not in choices and not (number and whole and value >= 0):
+            if name not in choices and not (number and whole and 0 <= value < math.inf):
                 raise self.wrong(full, f"{value!r} is not a number from 0")
         return Measuring(**given)

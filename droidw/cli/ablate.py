@@ -125,7 +125,8 @@ def main(args: argparse.Namespace) -> int:
         raise Interrupted(
             "the ablation was stopped by a signal",
             stop.signum,
-            f"finished cells stay in {folder}; the same command goes on with the others",
+            f"finished cells stay in {folder}; the same command"
+            f"{', without --again,' if args.again else ''} goes on with the others",
         )
     return _code(table)
 

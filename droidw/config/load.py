@@ -122,7 +122,8 @@ def load_config(
         return merger
 
     merger = merged("")
-    source = merger.data["input"].get("source")
+    given = merger.data["input"]  # whatever is no section is refused later on, with its line
+    source = given.get("source") if isinstance(given, Mapping) else None
     if preset is not None and isinstance(source, str) and ":" in source:
         merger = merged(source)
     return LoadedConfig(merger.data, merger.sources, tuple(merger.files), preset)

@@ -15,7 +15,7 @@ from droidw.errors import InputError
 from droidw.eval.associate import DEFAULT_MAX_DIFF, associate
 from droidw.io.images import list_images
 from droidw.io.listing import Entry, in_folder, read_listing
-from droidw.io.masks import numbers_in_names, seconds_in_names
+from droidw.io.masks import numbers_in_names, seconds_in_names, written_by_droidw
 from droidw.io.notes import Notes
 
 __all__ = [
@@ -48,7 +48,7 @@ def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
     mask has the name of its frame, or a name that is its time in seconds. Where no mask has such a
     name, they go by order if there are as many as frames, else by number, if their names are
     indices of frames counted from 0. Where no frames are known, they go by number if numbers are
-    missing between theirs, else by order.
+    missing between theirs, else by order. Those that droidw wrote (`scale.json`) go by number.
 
     Args:
         folder: of the masks. source: folder that the run was made from, if it is known.
@@ -59,6 +59,8 @@ def find_masks(folder: Path, source: Path | None = None) -> dict[int, Path]:
     files = pictures_in(folder)
     if not files:
         raise InputError(f"{folder}: holds no masks", "expected pictures, white where it moves")
+    if written_by_droidw(folder):
+        return numbers_in_names(files)
     by_stem = {path.stem: path for path in files}
     frames = frames_beside(folder, source)
     named = {index: by_stem[name] for index, name, _ in frames if name in by_stem}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ from droidw.config.load import load_config
 from droidw.config.packaged import packaged_in
 from droidw.errors import ConfigError, InputError, MissingRequirementError, UsageError
 from droidw.plugin.registry import PluginNotFound
+
+ROOM = "{a: {source: 'synthetic:static'}}"
 
 
 def config(cell):
@@ -120,6 +123,28 @@ def test_a_cell_depends_on_plugin_files_and_where_datasets_lie(
     assert (len(set(balloon)), len(set(orbit))) == (3, 1)
     monkeypatch.setenv("DROIDW_DATA", str(tmp_path / "elsewhere"))
     assert digests()[0] == balloon[2]
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ("vary: [input]", "vary: 'input' cannot be set to a seed"),
+        ("vary: [input.source]", "vary: 'input.source' cannot be set to a seed"),
+        ("measure: {t_max_diff: .inf}", "measure.t_max_diff: inf is not a number from 0"),
+    ],
+)
+def test_what_no_cell_could_be_made_with_is_refused(tmp_path, lines, said):
+    file = tmp_path / "p.yaml"
+    file.write_text(f"preset: cpu\nsequences: {ROOM}\nrows: {{full: {{}}}}\n{lines}\n")
+    with pytest.raises(ConfigError, match=re.escape(said)):
+        load_plan(str(file))
+
+
+def test_a_row_whose_input_is_no_section_is_refused(tmp_path, plugins):
+    file = tmp_path / "p.yaml"
+    file.write_text(f"preset: cpu\nsequences: {ROOM}\nrows: {{full: {{input: x}}}}\n")
+    with pytest.raises(ConfigError, match=re.escape("rows.full: input: 'x' is no section")):
+        make_cells(load_plan(str(file)), plugins)
 
 
 def test_sequences_with_settings_and_sources(tmp_path, plugins):

@@ -169,8 +169,8 @@ def test_no_gpu(run, monkeypatch):
 
 def test_too_small_to_track(run):
     code, _, wrong, _ = run("synthetic:static", "camera.size=[16,16]")
-    assert code == 3
-    assert "16x16 pixels is too small" in wrong
+    assert code == 2
+    assert "camera.size: [16, 16] is not a working size" in wrong and "at least 32" in wrong
 
 
 def test_source_and_overrides(tmp_path, monkeypatch):

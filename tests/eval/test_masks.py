@@ -325,3 +325,16 @@ def test_the_first_maps_may_be_left_out(tmp_path: Path) -> None:
     assert (rest.auc, rest.frames) == (1.0, 2)
     with pytest.raises(InputError, match="of 3 uncertainty maps, none is left after the first 3"):
         score_folder(root / "uncertainty", root / "mask", after=3)
+
+
+def test_masks_that_droidw_wrote_go_by_number(tmp_path):
+    source, masks = tmp_path / "clip", tmp_path / "masks"
+    for folder in (source, masks):
+        folder.mkdir()
+    for k in range(4):  # pictures that are counted from 1
+        cv2.imwrite(str(source / f"{k + 1:06d}.png"), np.zeros((8, 8), np.uint8))
+    for k in (0, 2):
+        cv2.imwrite(str(masks / f"{k:06d}.png"), np.zeros((8, 8), np.uint8))
+    assert find_masks(masks, source).keys() == {1}  # by name
+    (masks / "scale.json").write_text('{"named": "index"}')
+    assert find_masks(masks, source).keys() == {0, 2}
