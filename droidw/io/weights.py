@@ -24,7 +24,7 @@ __all__ = ["RECORDS", "find", "fingerprint", "load_state", "read_records", "read
 RECORDS = "weights.json"
 """File beside the weights that says what each of them is, with its hash."""
 
-_AGAIN = "get it again: droidw weights fetch NAME   (names: droidw weights list)"
+_AGAIN = "get it again: droidw weights fetch NAME --force   (names: droidw weights list)"
 _WRAPPERS = ("state_dict", "model", "model_state_dict")
 
 
