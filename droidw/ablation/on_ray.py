@@ -11,7 +11,7 @@ import signal
 import socket
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -79,7 +79,9 @@ def run_on_ray(
         room = max(1, round(jobs * max(each, default=1.0)))
         with _own_signals():
             _start(ray.init, address, room, place)
-        _run(cells, each, tell, limit, stopped)
+        # A cluster may grow; a Ray of our own has what this machine has.
+        resources: Any = ray.cluster_resources
+        _run(cells, each, tell, limit, stopped, None if address else resources())
     finally:
         ray.shutdown()
         if place:
@@ -128,12 +130,21 @@ def _run(
     tell: Tell,
     limit: float | None,
     stopped: Callable[[], bool],
+    there: Mapping[str, float] | None,
 ) -> None:
+    """Submit all cells and wait for them; those that need more than is `there` fail at once."""
     from ray import exceptions, get, remote, wait
 
     task: Any = remote(attend)
     pending = {}
     for (cell, folder), need in zip(cells, cpus, strict=True):
+        have = 0.0 if there is None else there.get("GPU", 0.0)
+        if there is not None and cell.gpus > have:  # Ray would wait for it for ever
+            why = (
+                f"it needs {cell.gpus:g} GPUs, and this machine has {have:g} (`needs` of the file)"
+            )
+            tell(cell, "failed", conclude(folder, 1, 0.0, why))
+            continue
         options = {"num_cpus": need, "num_gpus": cell.gpus, "max_retries": RETRIES}
         reference = task.options(name=cell.name, **options).remote(str(folder.resolve()), limit)
         pending[reference] = (cell, folder)

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from droidw.ablation import on_ray
-from droidw.ablation.cells import make_cells
+from droidw.ablation.cells import Cell, make_cells
 from droidw.ablation.on_ray import run_on_ray
 from droidw.ablation.plan import load_plan
 from droidw.ablation.run import Means, run_ablation
@@ -168,6 +168,15 @@ def test_a_cluster_that_does_not_answer(files):
         with pytest.raises(DroidwError, match="Ray cannot be started or reached") as caught:
             run_on_ray([], lambda *_: None, 1, address=place)
     assert "--ray-address" in caught.value.hint
+
+
+def test_a_cell_that_needs_more_than_there_is_fails_and_does_not_wait(tmp_path):
+    pytest.importorskip("ray", reason="extra ray")
+    told, cell = [], Cell("full", "room", 0, "seed: 0\n", gpus=64)
+    run_on_ray([(cell, tmp_path)], lambda _, state, outcome: told.append((state, outcome)), 1)
+    ((state, outcome),) = told
+    assert state == "failed"
+    assert outcome.error.startswith("it needs 64 GPUs, and this machine has ")
 
 
 def test_without_ray_it_is_said(files, monkeypatch):
