@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import logging
+import math
 import os
 import re
 import shutil
@@ -138,8 +139,8 @@ def _run(
     task: Any = remote(attend)
     pending = {}
     for (cell, folder), need in zip(cells, cpus, strict=True):
-        have = 0.0 if there is None else there.get("GPU", 0.0)
-        if there is not None and cell.gpus > have:  # Ray would wait for it for ever
+        have = math.inf if there is None else there.get("GPU", 0.0)
+        if cell.gpus > have:  # Ray would wait for it for ever
             why = (
                 f"it needs {cell.gpus:g} GPUs, and this machine has {have:g} (`needs` of the file)"
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from droidw.errors import InputError
 from droidw.eval.associate import DEFAULT_MAX_DIFF, associate
 from droidw.io.images import list_images
 from droidw.io.listing import Entry, in_folder, read_listing
-from droidw.io.masks import numbers_in_names, seconds_in_names, written_by_droidw
+from droidw.io.masks import facts_of, numbers_in_names, seconds_in_names, written_by_droidw
 from droidw.io.notes import Notes
 
 __all__ = [
@@ -148,10 +147,9 @@ def shapes_shown(
     """
     found = []
     try:
-        facts = json.loads((uncertainty / "scale.json").read_text(encoding="utf-8"))
-        width, height = (int(side) for side in facts["picture"])
+        width, height = (int(side) for side in facts_of(uncertainty)["picture"])
         found.append((width, height))
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         pass  # maps of another program, or of an older droidw
     for _, _, path in _pictures(masks, source)[:1]:
         picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)

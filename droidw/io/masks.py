@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from droidw.errors import InputError
 from droidw.io.images import list_images
 from droidw.slam.frame import RawFrame
 
-__all__ = ["UserMasks", "numbers_in_names", "seconds_in_names", "written_by_droidw"]
+__all__ = ["UserMasks", "facts_of", "numbers_in_names", "seconds_in_names", "written_by_droidw"]
 
 _LOSSLESS = (".png", ".bmp", ".tif", ".tiff")
 _LOSSY = (".jpg", ".jpeg")
@@ -151,9 +152,14 @@ def seconds_in_names(files: Sequence[Path]) -> npt.NDArray[np.float64] | None:
 
 
 def written_by_droidw(folder: Path) -> bool:
-    """Whether the exporter wrote these masks, named by the index of the frame."""
+    """Whether an exporter wrote these pictures, named by the index of the frame."""
+    return facts_of(folder).get("named") == "index"
+
+
+def facts_of(folder: Path) -> dict[str, Any]:
+    """What the `scale.json` of an exporter says of the pictures beside it; {} without one."""
     try:
         facts = json.loads((folder / "scale.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        return False
-    return isinstance(facts, dict) and facts.get("named") == "index"
+        return {}
+    return facts if isinstance(facts, dict) else {}

@@ -106,19 +106,19 @@ _ROUNDS = 8
 
 
 def diagnose(
-    store: KeyframeStore, moved: Sequence[float], matched: Sequence[float], lost_below: float
+    store: KeyframeStore, frames: int, matched: Sequence[float], lost_below: float
 ) -> Diagnosis:
     """Facts known after tracking.
 
     Args:
         store: keyframes.
-        moved: flow of each frame but the first against its reference, cells.
-        matched: matched share of the same.
+        frames: how many were tracked.
+        matched: matched share of each frame but the first with its reference.
         lost_below: matched share of a frame that counts as lost.
     """
     lost = sum(share < lost_below for share in matched) / max(1, len(matched))
     return Diagnosis(
-        frames=len(moved) + 1,
+        frames=frames,
         keyframes=len(store),
         still=len(store) < 2,
         lost=lost,

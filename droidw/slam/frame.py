@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
     from droidw.geometry.camera import Camera
 
-__all__ = ["CloudPoints", "Frame", "KeyframeRecord", "RawFrame", "RunResult", "Trajectory"]
+__all__ = [
+    "CloudPoints", "Frame", "KeyframeRecord", "RawFrame", "RunResult", "Trajectory", "is_blank",
+]  # fmt: skip
 
 # Standard deviation of the strongest colour channel of a picture below which it shows nothing.
 _BLANK = 0.02
@@ -35,6 +37,11 @@ class RawFrame:
     time: float
     image: npt.NDArray[np.uint8]
     name: str = ""
+
+
+def is_blank(image: Tensor) -> bool:
+    """Whether a picture [3,H,W] in [0,1] shows too little to learn anything from."""
+    return image.numel() > 0 and float(image.flatten(1).std(1).max()) < _BLANK
 
 
 @dataclass(frozen=True)
@@ -60,8 +67,7 @@ class Frame:
     @property
     def is_blank(self) -> bool:
         """Whether the picture shows next to nothing: black, a cap on the lens."""
-        image = self.image
-        return image.numel() > 0 and float(image.flatten(1).std(1).max()) < _BLANK
+        return is_blank(self.image)
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,6 @@ class SlamSystem:
         self._keyframes = Keyframes(self.optimiser, self._maps, self._renews)
         self._times: list[float] = []
         self._indices: list[int] = []
-        self._moved: list[float] = []
         self._matched: list[float] = []
         self._kept: dict[int, object] = {}
         self._newest: tuple[Encoded, Verdict] | None = None
@@ -228,7 +227,6 @@ class SlamSystem:
         self._times.append(frame.time)
         self._indices.append(frame.index)
         if verdict.motion is not None:
-            self._moved.append(verdict.motion.flow)
             self._matched.append(verdict.motion.matched)
         self._remember(current)
         kept = False
@@ -277,9 +275,8 @@ class SlamSystem:
         self.frontend.release()
         self._reveal()
         found = diagnose(
-            self.store, self._moved, self._matched, self.config.motion_filter.lost_below
+            self.store, self.frames, self._matched, self.config.motion_filter.lost_below
         )
-        found = replace(found, frames=self.frames)
         if found.still:
             self._hold_still()
         elif not brief:

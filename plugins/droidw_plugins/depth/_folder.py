@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import math
 import re
@@ -19,7 +18,7 @@ import torch
 from droidw.errors import ConfigError, InputError
 from droidw.interfaces.depth import DepthMap
 from droidw.io.listing import without_remark
-from droidw.io.masks import numbers_in_names, seconds_in_names, written_by_droidw
+from droidw.io.masks import facts_of, numbers_in_names, seconds_in_names, written_by_droidw
 from droidw_plugins.depth._lookup import Lookup, Rule
 from droidw_plugins.depth.file import FileDepthOptions
 
@@ -152,10 +151,10 @@ def _own(folder: Path) -> _Own | None:
     says = folder.parent if folder.name == "full" else folder
     if not written_by_droidw(says):
         return None
+    facts = facts_of(says)
     try:
-        facts = json.loads((says / "scale.json").read_text(encoding="utf-8"))
         own = _Own(float(facts["scale"]), facts["unit"] == "metres")
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         return None
     return own if math.isfinite(own.scale) and own.scale > 0 else None
 

@@ -18,9 +18,7 @@ from torch.nn import functional as F
 
 from droidw_plugins.features._efficientnet import ChannelStatistics
 
-__all__ = ["Calibration", "from_picture", "from_weights", "is_blank", "of_nothing"]
-
-_BLANK = 0.02  # standard deviation of the strongest colour channel
+__all__ = ["Calibration", "from_picture", "from_weights", "of_nothing"]
 
 
 @dataclass(frozen=True)
@@ -61,11 +59,6 @@ def of_nothing(like: Tensor, constant: float, length: float) -> Tensor:
     if constant > 0:
         found[-1] = length
     return found
-
-
-def is_blank(image: Tensor) -> bool:
-    """Whether a picture [3,H,W] in [0,1] shows too little to learn a spread from."""
-    return float(image.flatten(1).std(1).max()) < _BLANK
 
 
 def from_weights(

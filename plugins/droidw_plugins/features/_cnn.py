@@ -12,11 +12,11 @@ from torch.nn import functional as F
 
 from droidw.errors import ConfigError, MissingRequirementError
 from droidw.plugin.component import BuildContext
+from droidw.slam.frame import is_blank
 from droidw_plugins.features._calibration import (
     Calibration,
     from_picture,
     from_weights,
-    is_blank,
     of_nothing,
 )
 from droidw_plugins.features._efficientnet import CENTRES, FINE, load_trunk

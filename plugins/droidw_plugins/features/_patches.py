@@ -14,10 +14,11 @@ from droidw.geometry.transfer import upload
 from droidw.io.weights import fingerprint
 from droidw.plugin.component import BuildContext
 from droidw.plugin.weights import WeightsFile
+from droidw.slam.frame import is_blank
 from droidw_plugins._vit.layers import choose_dtype, exact
 from droidw_plugins._vit.model import PATCH
 from droidw_plugins._vit.published import blaming, load_transformer, read_published
-from droidw_plugins.features._calibration import Calibration, from_picture, is_blank, of_nothing
+from droidw_plugins.features._calibration import Calibration, from_picture, of_nothing
 from droidw_plugins.features._efficientnet import ChannelStatistics
 from droidw_plugins.features._patch_options import PatchOptions
 
