@@ -1,8 +1,8 @@
-"""Masks and uncertainty maps as files: which mask belongs to which picture, and reading."""
+"""Masks and uncertainty maps as files: which belongs to which picture, and reading."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +14,20 @@ from droidw.errors import InputError
 from droidw.eval.associate import DEFAULT_MAX_DIFF, associate
 from droidw.io.images import list_images
 from droidw.io.listing import Entry, in_folder, read_listing
-from droidw.io.masks import facts_of, numbers_in_names, seconds_in_names, written_by_droidw
+from droidw.io.masks import numbers_in_names, seconds_in_names, written_by_droidw
 from droidw.io.notes import Notes
 
 __all__ = [
-    "check_shape",
     "find_masks",
     "frames_beside",
+    "listed",
+    "objects_by_number",
     "pictures_in",
     "read_mask",
     "read_uncertainty",
-    "resize_mask",
-    "shapes_shown",
 ]
 
 _PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
-_STRETCH = 0.05
-"""Largest relative difference of two ratios of sides that counts as the same shape: cropping to
-whole cells takes off a few pixels."""
-
 _LOSSY = (".jpg", ".jpeg")
 _HALF, _MOST_OBJECTS, _COLOURED = 127, 32, 31
 """Grey levels: what is brighter moves; numbers of objects go so far; channels of a colour differ by
@@ -102,10 +97,11 @@ def frames_beside(folder: Path, source: Path | None = None) -> list[tuple[int, s
 
     Listed as the readers of folders list them, so that a picture has the index that a run gives it.
     """
-    return [(index, path.stem, time) for index, time, path in _pictures(folder, source)]
+    return [(index, path.stem, time) for index, time, path in listed(folder, source)]
 
 
-def _pictures(folder: Path, source: Path | None) -> list[Entry]:
+def listed(folder: Path, source: Path | None) -> list[Entry]:
+    """The pictures of the source, else those beside masks, as readers of folders list them."""
     for root in (source, folder.parent):
         if root is None or not root.is_dir():
             continue
@@ -137,84 +133,52 @@ def pictures_in(folder: Path) -> list[Path]:
     return [path for path in list_images(folder) if path.suffix.lower() in _PICTURES]
 
 
-def shapes_shown(
-    uncertainty: Path, masks: Path, source: Path | None = None
-) -> list[tuple[int, int]]:
-    """Sizes (width, height) of which a mask may have the shape: working picture, raw picture.
-
-    The first is what `scale.json` beside the maps says, the second that of a picture beside the
-    masks or in the source; what is not known is left out.
-    """
-    found = []
-    try:
-        width, height = (int(side) for side in facts_of(uncertainty)["picture"])
-        found.append((width, height))
-    except (ValueError, KeyError, TypeError):
-        pass  # maps of another program, or of an older droidw
-    for _, _, path in _pictures(masks, source)[:1]:
-        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        if picture is not None:
-            found.append((picture.shape[1], picture.shape[0]))
-    return [(width, height) for width, height in found if width > 0 and height > 0]
-
-
-def check_shape(
-    path: Path,
-    mask: npt.NDArray[np.bool_],
-    u: npt.NDArray[Any],
-    shown: Sequence[tuple[int, int]] = (),
-) -> None:
-    """Refuse a mask whose sides have another ratio than those of the picture under its map.
-
-    Args:
-        path, mask: the mask [H,W] and its file. u: the map [h,w].
-        shown: sizes of pictures that the mask may show; without any, the map itself tells the
-            ratio as far as whole cells do.
-    Raises:
-        InputError: the mask does not show what the map shows.
-    """
-    height, width = mask.shape
-    rows, columns = u.shape
-    ratio = width / height
-    if any(abs(ratio * h / w - 1) <= _STRETCH for w, h in shown):
-        return
-    least, most = columns / (rows + 1), (columns + 1) / rows
-    slack = 1 + _STRETCH
-    if not shown and min(least, columns / rows / slack) <= ratio <= max(
-        most, columns / rows * slack
-    ):
-        return
-    sizes = " or ".join(dict.fromkeys(f"{w}x{h}" for w, h in shown))
-    raise InputError(
-        f"{path}: a mask of {width}x{height} pixels does not fit "
-        + (f"pictures of {sizes}" if sizes else f"uncertainty maps of {columns}x{rows} cells")
-        + ": it has another shape",
-        "masks may be of any size, but must show the whole picture; give those of this footage: "
-        "--masks DIR",
-    )
-
-
-def read_mask(path: Path) -> npt.NDArray[np.bool_]:
+def read_mask(path: Path, numbered: bool | None = None) -> npt.NDArray[np.bool_]:
     """A mask [H,W] bool from a picture: True where it moves.
 
     That is what is brighter than half, or has a colour, as where each object has one. Where values
-    have 16 bits, or nothing is brighter than a few grey levels, these are numbers of objects, and
-    all but 0 moves.
+    have 16 bits, or are numbers of objects, all but 0 moves.
 
+    Args:
+        path: of the picture. numbered: whether values are numbers of objects, as
+            `objects_by_number` tells of all masks; None: as it does of this one alone.
     Raises:
         InputError: if the file is no picture.
     """
+    picture = _values(path)
+    brightest, darkest = picture.max(axis=2), picture.min(axis=2)
+    if picture.dtype != np.uint8:
+        return np.asarray(brightest > 0)
+    if path.suffix.lower() in _LOSSY:  # its black is not clean, and its grey not without colour
+        return np.asarray(brightest > _HALF)
+    if _may_be_numbers(path, picture) if numbered is None else numbered:
+        return np.asarray(brightest > 0)
+    return np.asarray((brightest > _HALF) | (brightest - darkest > _COLOURED))
+
+
+def objects_by_number(paths: Iterable[Path]) -> bool:
+    """Whether the values of masks are numbers of objects: none is brighter than a few grey levels.
+
+    Told of all masks of a folder at once: one alone may be dark because nothing moves in it.
+
+    Raises:
+        InputError: if a file is no picture.
+    """
+    return all(_may_be_numbers(path, _values(path)) for path in paths)
+
+
+def _may_be_numbers(path: Path, picture: npt.NDArray[Any]) -> bool:
+    grey = bool((picture == picture[..., :1]).all())
+    lossless = path.suffix.lower() not in _LOSSY
+    return lossless and grey and int(picture.max(initial=0)) <= _MOST_OBJECTS
+
+
+def _values(path: Path) -> npt.NDArray[Any]:
+    """The values [H,W,3] of a mask, as they are stored."""
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if picture is None:
         raise InputError(f"{path}: cannot be read as a picture")
-    if np.asarray(picture).dtype != np.uint8:
-        return np.asarray(np.asarray(picture).max(axis=2) > 0)
-    brightest, darkest = np.asarray(picture).max(axis=2), np.asarray(picture).min(axis=2)
-    if path.suffix.lower() in _LOSSY:  # its black is not clean, and its grey not without colour
-        return np.asarray(brightest > _HALF)
-    if np.array_equal(brightest, darkest) and brightest.max(initial=0) <= _MOST_OBJECTS:
-        return np.asarray(brightest > 0)
-    return np.asarray((brightest > _HALF) | (brightest - darkest > _COLOURED))
+    return np.asarray(picture)
 
 
 def read_uncertainty(path: Path) -> npt.NDArray[np.uint16]:
@@ -229,16 +193,3 @@ def read_uncertainty(path: Path) -> npt.NDArray[np.uint16]:
     if picture.ndim != 2:
         raise InputError(f"{path}: is a colour picture", "uncertainty maps are grey, 16 bits")
     return np.asarray(picture).astype(np.uint16)
-
-
-def resize_mask(mask: npt.NDArray[np.bool_], shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """Reduce a mask [H,W] to a grid [h,w]: True where at least half of a cell's area moves."""
-    height, width = shape
-    if mask.shape == shape:
-        return np.array(mask, dtype=bool)
-    if height <= mask.shape[0] and width <= mask.shape[1]:
-        share = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-        # Half a cell may come out as 0.4999999.
-        return np.asarray(share >= 0.5 - 1e-5)
-    near = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-    return np.asarray(near > 0)

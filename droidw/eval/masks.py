@@ -11,15 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from droidw.errors import InputError
+from droidw.eval.mask_cells import Cells
 from droidw.eval.mask_files import (
-    check_shape,
     find_masks,
     frames_beside,
+    objects_by_number,
     pictures_in,
     read_mask,
     read_uncertainty,
-    resize_mask,
-    shapes_shown,
 )
 
 __all__ = ["MaskScore", "score_folder", "score_masks"]
@@ -132,8 +131,8 @@ def score_folder(
 ) -> MaskScore:
     """Score the maps `uncertainty/NNNNNN.png` (named by frame index) against a folder of masks.
 
-    Both are taken to show the same field of view, so that a mask of any size is reduced to that of
-    its map; one of another shape is refused. Which mask belongs to which picture: `find_masks`.
+    A mask of any size goes the way that the pictures went (`Cells`); one of another shape is
+    refused. Which mask belongs to which picture: `find_masks`.
 
     Args:
         uncertainty: folder of maps. masks: folder of masks, see `find_masks`.
@@ -171,14 +170,14 @@ def score_folder(
             f"{masks}: no mask belongs to any of the {len(maps)} uncertainty maps in {uncertainty}",
             "name each mask like its picture, or give one mask per picture, in their order",
         )
-    shown = shapes_shown(uncertainty, masks, source)
+    cells = Cells(uncertainty, masks, source)
+    numbered = objects_by_number(mask for _, mask in pairs)
     values: list[npt.NDArray[Any]] = []
     truth: list[npt.NDArray[np.bool_]] = []
     for map_path, mask_path in pairs:
-        u, mask = read_uncertainty(map_path), read_mask(mask_path)
-        check_shape(mask_path, mask, u, shown)
+        u, mask = read_uncertainty(map_path), read_mask(mask_path, numbered)
         values.append(u)
-        truth.append(resize_mask(mask, (u.shape[0], u.shape[1])))
+        truth.append(cells.lay(mask_path, mask, u))
     notes = []
     if len(pairs) < len(maps):
         notes.append(

@@ -19,7 +19,7 @@ from droidw.eval.masks import score_folder
 from droidw.eval.metrics import score
 from droidw.eval.summary import told_what_moves
 from droidw.events import Dispatcher, Progress, RunFailed, RunFinished, RunStarted
-from droidw.geometry.camera import Rectifier
+from droidw.geometry.rectify import Rectification, Rectifier
 from droidw.io.files import write_json, write_text
 from droidw.io.prefetch import prefetch
 from droidw.io.tum import write_tum
@@ -208,7 +208,7 @@ class _Run:
                 f"; focal length refined to {outcome.focal.factor:.3f} times that, "
                 f"{camera.fx * outcome.focal.factor:.1f} px of the raw picture"
             )
-        result = self._export(source, outcome)
+        result = self._export(source, outcome, rectify.way)
         self._conclude(failure, result, outcome)
         return result
 
@@ -297,7 +297,7 @@ class _Run:
             "parts": {slot: part.name for slot, (part, _) in self.resolved.parts.items()},
         }
 
-    def _export(self, source: FrameSource, outcome: Outcome) -> RunResult:
+    def _export(self, source: FrameSource, outcome: Outcome, way: Rectification) -> RunResult:
         self.folder.begin()
         texts = [*outcome.diagnosis.warnings(), *(self.masks.problems() if self.masks else ())]
         texts += told(outcome.reports)
@@ -319,6 +319,7 @@ class _Run:
             truth=truth,
             manifest=self._manifest(source, outcome),
             run_dir=self.run_dir,
+            rectification=way,
         )
         total = len(self.resolved.exporters)
         with self.clock("export"):

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from droidw.geometry.camera import Camera
+    from droidw.geometry.rectify import Rectification
 
 __all__ = [
     "CloudPoints", "Frame", "KeyframeRecord", "RawFrame", "RunResult", "Trajectory", "is_blank",
@@ -143,6 +144,7 @@ class RunResult:
         source: what was run on; truth: ground-truth trajectory if the source has one.
         manifest: facts of the run (versions, timings, assumptions), JSON-able.
         warnings: sentences.
+        rectification: how raw pictures became working pictures, if that is known.
     """
 
     trajectory: Trajectory
@@ -156,3 +158,4 @@ class RunResult:
     manifest: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     run_dir: Path | None = None
+    rectification: Rectification | None = None

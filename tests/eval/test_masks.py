@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from droidw.errors import InputError
-from droidw.eval.mask_files import check_shape, find_masks, read_mask, resize_mask
+from droidw.eval.mask_cells import check_shape, resize_mask
+from droidw.eval.mask_files import find_masks, read_mask
 from droidw.eval.masks import score_folder, score_masks
 
 
@@ -302,6 +303,19 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 def test_what_moves_in_masks_of_all_kinds(tmp_path: Path, picture, moves) -> None:
     cv2.imwrite(str(tmp_path / "m.png"), np.array([picture], np.uint8))
     assert read_mask(tmp_path / "m.png").tolist() == [[bool(one) for one in moves]]
+
+
+def test_a_dark_mask_among_soft_ones_holds_no_numbers(tmp_path: Path) -> None:
+    root = folder(tmp_path, ["a", "b"], listed=True)
+    soft = np.full((48, 64), 12, np.uint8)  # probabilities: hardly anywhere is it surely nothing
+    cv2.imwrite(str(root / "mask" / "a.png"), soft)
+    soft[:, :32] = 240
+    cv2.imwrite(str(root / "mask" / "b.png"), soft)
+    found = score_folder(root / "uncertainty", root / "mask")
+    assert found.moving == 0.25  # half of the second picture
+    for name in "ab":  # all of them dark: numbers of objects
+        cv2.imwrite(str(root / "mask" / f"{name}.png"), np.where(soft > 127, 3, 0).astype(np.uint8))
+    assert score_folder(root / "uncertainty", root / "mask").moving == 0.5
 
 
 def test_the_black_of_a_jpeg_is_not_clean(tmp_path: Path) -> None:

@@ -12,7 +12,9 @@ import pytest
 import torch
 
 from droidw.errors import InputError
-from droidw.geometry.camera import Camera, Grid, Rectifier, working_size
+from droidw.geometry.camera import Camera, Grid
+from droidw.geometry.rectify import Rectifier
+from droidw.geometry.sizes import working_size
 from droidw.slam.frame import RawFrame
 
 CAMERA = Camera(640, 480, 525.0, 520.0, 318.3, 243.1)

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from droidw.errors import InputError
-from droidw.geometry.camera import Camera, Grid, Rectifier
+from droidw.geometry.camera import Camera, Grid
+from droidw.geometry.rectify import Rectifier
 from droidw.io.masks import UserMasks
 from droidw.slam.frame import RawFrame
 

@@ -12,7 +12,7 @@ import droidw
 from droidw.config.load import load_config
 from droidw.config.resolve import resolve
 from droidw.events import Dispatcher
-from droidw.geometry.camera import Rectifier
+from droidw.geometry.rectify import Rectifier
 from droidw.geometry.se3 import inv, log, mul
 from droidw.plugin.component import BuildContext
 from droidw.slam.frame import RawFrame

@@ -6,7 +6,8 @@ import torch
 
 from droidw.errors import InputError, UsageError
 from droidw.geometry import projective, se3
-from droidw.geometry.camera import Grid, Rectifier
+from droidw.geometry.camera import Grid
+from droidw.geometry.rectify import Rectifier
 from droidw.interfaces.correspondence import Correspondence, EdgeRequest
 from droidw.interfaces.datasets import DatasetReader, FrameSource, Selection
 from droidw.plugin.component import BuildContext

@@ -157,6 +157,8 @@ class UncertaintyExporter:
             "offset": result.offset,
             "picture": [result.camera.width, result.camera.height],
         }
+        if result.rectification is not None:  # so that masks of raw pictures can be laid on cells
+            facts["rectified"] = result.rectification.to_dict()
         write_json(path, facts)
         return [*written, path]
 
