@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy.typing as npt
 
 from droidw.errors import InputError, UsageError
 
-__all__ = ["DEFAULT_MAX_DIFF", "Association", "associate"]
+__all__ = ["DEFAULT_MAX_DIFF", "Association", "associate", "uncrossed"]
 
 DEFAULT_MAX_DIFF = 0.02
 """Largest difference of two matched stamps in seconds, unless one asks for another."""
@@ -109,6 +110,31 @@ def associate(
         max_diff=max_diff,
         offset=offset,
     )
+
+
+def uncrossed(
+    times: npt.NDArray[np.float64], diff: npt.NDArray[np.float64]
+) -> npt.NDArray[np.bool_]:
+    """Which pairs [M] to keep so that none crosses another, those that are closest first.
+
+    Where more than the distance of two stamps is allowed, a stamp whose own partner is missing may
+    go with one beyond those of its neighbours; along such pairs the camera would go to and fro.
+
+    Args:
+        times: [M] of the reference, in the order of the estimate. diff: [M] of each pair, seconds.
+    """
+    keep = np.ones(len(times), dtype=bool)
+    if (np.diff(times) >= 0).all():
+        return keep
+    rows: list[int] = []  # kept so far; their times rise with them
+    for row in np.argsort(np.abs(diff), kind="stable").tolist():
+        place = bisect_left(rows, row)
+        after = place == 0 or times[rows[place - 1]] <= times[row]
+        before = place == len(rows) or times[row] <= times[rows[place]]
+        keep[row] = after and before
+        if keep[row]:
+            rows.insert(place, row)
+    return keep
 
 
 def _mutual_nearest(

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from droidw.errors import InputError, UsageError
-from droidw.eval.associate import DEFAULT_MAX_DIFF, associate
+from droidw.eval.associate import DEFAULT_MAX_DIFF, associate, uncrossed
 from droidw.eval.relative import Delta, pairs, relative_errors
 from droidw.geometry.align import umeyama
 from droidw.slam.frame import Trajectory
@@ -200,14 +200,20 @@ def score(
     est, skipped = _usable(estimate, names[0], notes)
     ref, ref_skipped = _usable(reference, names[1], notes)
     length = _length(ref.T_wc[:, :3], normalise, names[1])
-    matches = associate(
-        est.times, ref.times, max_diff, offset, minimum=3 if align in ("sim3", "se3") else 2
-    )
-    poses, truth = est.T_wc[matches.est], ref.T_wc[matches.ref]
+    minimum = 3 if align in ("sim3", "se3") else 2
+    matches = associate(est.times, ref.times, max_diff, offset, minimum)
+    keep = uncrossed(ref.times[matches.ref], matches.diff)
+    diff, rows = matches.diff[keep], matches.ref[keep]
+    if len(rows) < minimum:
+        raise InputError(
+            f"of {len(matches)} pairs of stamps, {len(matches) - len(rows)} cross others in time",
+            f"{max_diff:g} s is more than the distance of stamps: give a smaller --t-max-diff",
+        )
+    poses, truth = est.T_wc[matches.est[keep]], ref.T_wc[rows]
     # Both, so that without a scale in the alignment they still compare.
     poses[:, :3] /= length
     truth[:, :3] /= length
-    times = ref.times[matches.ref]
+    times = ref.times[rows]
     scale, R, t = _alignment(poses[:, :3], truth[:, :3], align, notes)
     aligned = scale * poses[:, :3] @ R.T + t
     errors = np.linalg.norm(aligned - truth[:, :3], axis=1)
@@ -217,6 +223,11 @@ def score(
         notes.append(
             f"{len(est) - len(matches)} of {len(est)} poses have no reference within "
             f"{max_diff:g} s and are left out"
+        )
+    if len(rows) < len(matches):
+        notes.append(
+            f"{len(matches) - len(rows)} pairs of stamps cross others in time, and are left out: "
+            f"{max_diff:g} s is more than the distance of stamps"
         )
     if not len(first):
         notes.append(f"no two matched frames lie {delta} apart: there is no RPE")
@@ -228,12 +239,12 @@ def score(
         normalise=normalise,
         unit=unit if normalise == "none" else normalise,
         frames=len(est),
-        matched=len(matches),
+        matched=len(rows),
         ref_frames=len(ref),
         skipped=skipped,
         ref_skipped=ref_skipped,
         max_diff=max_diff,
-        worst_diff=float(np.abs(matches.diff).max()),
+        worst_diff=float(np.abs(diff).max()),
         scale=scale,
         path_length=path_length(truth[:, :3]),
         path_length_est=path_length(aligned),

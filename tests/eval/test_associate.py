@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from droidw.errors import InputError, UsageError
-from droidw.eval.associate import associate
+from droidw.eval.associate import associate, uncrossed
 
 
 def greedy(est: np.ndarray, ref: np.ndarray, max_diff: float) -> list[tuple[int, int]]:
@@ -30,6 +30,13 @@ def test_same_pairs_as_taking_the_closest_first(seed: int) -> None:
     est, ref = rng.uniform(0, 2, 60), rng.uniform(0, 2, 90)
     found = associate(est, ref, 0.02)
     assert list(zip(found.est.tolist(), found.ref.tolist(), strict=True)) == greedy(est, ref, 0.02)
+
+
+def test_of_two_pairs_that_cross_the_closer_stays() -> None:
+    times = np.array([0.0, 0.2, 0.1, 0.3, 0.35, 0.34])
+    gaps = np.array([0.0, 0.1, -0.02, 0.0, 0.03, -0.01])
+    assert uncrossed(times, gaps).tolist() == [True, False, True, True, False, True]
+    assert uncrossed(np.array([0.0, 1.0, 1.0, 2.0]), gaps[:4]).all()
 
 
 def test_each_stamp_is_used_once_and_the_closest_wins() -> None:

@@ -65,6 +65,22 @@ def test_by_hand_without_alignment() -> None:
     assert found.scale == 1.0
 
 
+def test_pairs_that_cross_in_time_are_left_out() -> None:
+    """Both have gaps, and far more time is allowed than lies between two stamps."""
+    whole = straight([float(k) for k in range(30)])
+    here, there = (np.setdiff1d(np.arange(30), gone) for gone in ([8, 14, 25], [5, 12, 20]))
+    est = Trajectory(whole.times[here], whole.T_wc[here])
+    ref = Trajectory(whole.times[there] + 0.1, whole.T_wc[there])
+    found = score(est, ref, align="none", max_diff=6.0)
+    assert found.path_length_est == pytest.approx(found.path_length)  # nowhere to and fro
+    assert found.matched == 24
+    assert found.notes[0].startswith("3 pairs of stamps cross others in time")
+    few = Trajectory(np.array([0.9, 1.1, 0.5]), whole.T_wc[:3])
+    with pytest.raises(InputError, match="cross others in time") as caught:
+        score(straight([0, 1, 2]), few, max_diff=9)
+    assert "--t-max-diff" in caught.value.hint
+
+
 def test_similarity_is_taken_out() -> None:
     truth = random_walk(60, 1)
     found = score(moved(truth), truth)
