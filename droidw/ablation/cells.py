@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,9 @@ from droidw.io.files import write_json, write_text
 if TYPE_CHECKING:
     from droidw.plugin.manager import Plugins
 
-__all__ = ["Cell", "Outcome", "make_cells", "prepare", "read_outcome"]
+__all__ = ["Cell", "Outcome", "forget", "make_cells", "prepare", "read_outcome", "take"]
+
+_PREPARED = ("cell.yaml", "cell.json")
 
 # Written in C where PyYAML has it: there is a configuration for every cell.
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
@@ -270,15 +273,16 @@ def prepare(
     plugin_files: Sequence[str] = (),
     data: Path | None = None,
 ) -> None:
-    """Write what the process of a cell reads: `cell.yaml` and `cell.json`.
+    """Write what the process of a cell reads, `cell.yaml` and `cell.json`, until it takes them.
+
+    Until then the folder keeps what an earlier call left: files and results go together.
 
     Args:
         cell: what is run. folder: of the cell. measure: how it is measured.
         plugin_files: as given with --plugin. data: folder of datasets, or None for the usual one.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "failure.json").unlink(missing_ok=True)
-    write_text(folder / "cell.yaml", cell.config)
+    write_text(folder / _waiting("cell.yaml"), cell.config)
     spec = {
         "row": cell.row,
         "sequence": cell.sequence,
@@ -290,7 +294,28 @@ def prepare(
         "folder": str(Path.cwd()),
         "measure": asdict(measure),
     }
-    write_json(folder / "cell.json", spec)
+    write_json(folder / _waiting("cell.json"), spec)
+
+
+def take(folder: Path) -> dict[str, Any]:
+    """Give up what came of a cell earlier, and take what has been prepared; returns `cell.json`."""
+    for name in ("result.json", "failure.json"):
+        (folder / name).unlink(missing_ok=True)
+    for name in _PREPARED:
+        with suppress(FileNotFoundError):  # taken before: the cell is tried once more
+            (folder / _waiting(name)).replace(folder / name)
+    spec: dict[str, Any] = json.loads((folder / "cell.json").read_text(encoding="utf-8"))
+    return spec
+
+
+def forget(folder: Path) -> None:
+    """Remove what has been prepared for a cell that was not started."""
+    for name in _PREPARED:
+        (folder / _waiting(name)).unlink(missing_ok=True)
+
+
+def _waiting(name: str) -> str:
+    return f".{name}.waiting"
 
 
 def read_outcome(cell: Cell, folder: Path, measure: Measuring) -> Outcome | None:

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from droidw.ablation.cells import Cell, Outcome
+from droidw.ablation.cells import Cell, Outcome, take
 from droidw.io.files import write_json
 
 __all__ = ["MODULE", "Tell", "attend", "conclude", "launch", "run_local"]
@@ -31,8 +31,7 @@ def launch(folder: Path) -> subprocess.Popen[bytes]:
 
     What came of it earlier is given up now and no sooner: cells that wait keep theirs.
     """
-    (folder / "result.json").unlink(missing_ok=True)
-    spec = json.loads((folder / "cell.json").read_text(encoding="utf-8"))
+    spec = take(folder)
     threads = str(spec["threads"])
     limits = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
     with (folder / "output.txt").open("wb") as output:

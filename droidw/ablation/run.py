@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from droidw.ablation.cells import Cell, Outcome, prepare, read_outcome
+from droidw.ablation.cells import Cell, Outcome, forget, prepare, read_outcome
 from droidw.ablation.files import write_files
 from droidw.ablation.local import Tell, run_local
 from droidw.ablation.on_ray import require_ray, run_on_ray
@@ -99,6 +99,11 @@ def run_ablation(
             else:
                 run_local(waiting, heard, means.jobs, means.limit, stopped)
         finally:
+            for cell, place in waiting:
+                forget(place)
+                # One that was not started keeps what came of it earlier (`means.again`).
+                if cell.name not in outcomes and (kept := read_outcome(cell, place, plan.measure)):
+                    outcomes[cell.name] = kept
             table = make_table(plan, [(cell, outcomes.get(cell.name)) for cell in cells])
             write_files(table, folder, command)
     return table

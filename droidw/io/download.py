@@ -227,6 +227,7 @@ class _Transfer:
     total: int = 0
     confirmed: bool = False
     ours: bool = False
+    broken: bool = False
     redirects: _Redirects = field(default_factory=_Redirects)
 
     def __post_init__(self) -> None:
@@ -321,6 +322,7 @@ class _Transfer:
         elif have and not self._fits(answer.headers.get("Content-Range", ""), have):
             self._truncate()
             return False
+        self.broken = False
         block = self._read(answer)
         if have == 0 and looks_like_html(block):
             return self._page(answer, block)
@@ -363,12 +365,15 @@ class _Transfer:
     def _write(stream: IO[bytes], block: bytes) -> None:
         stream.write(block)
 
-    @staticmethod
-    def _read(answer: Any) -> bytes:
+    def _read(self, answer: Any) -> bytes:
+        if self.broken:
+            raise _TryAgain("the connection broke")
         try:
             return bytes(answer.read(_CHUNK))
         except http.client.IncompleteRead as error:
-            return bytes(error.partial)
+            # What has come is kept first. A file sent without its length would end there.
+            self.broken = True
+            return bytes(error.partial) or self._read(answer)
         except (OSError, http.client.HTTPException) as error:
             raise _TryAgain(f"the connection broke ({error})") from error
 

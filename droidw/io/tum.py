@@ -113,16 +113,18 @@ def _parse(fields: list[str]) -> tuple[list[float], str]:
     return row, ""
 
 
-def write_tum(path: Path | str, trajectory: Trajectory, *, header: bool = True) -> None:
+def write_tum(
+    path: Path | str, trajectory: Trajectory, *, header: bool = True, digits: int = 9
+) -> None:
     """Write a trajectory: exactly 8 columns, the same bytes for the same numbers.
 
-    Times keep every digit of their float64, values have 9 significant digits. The file appears
-    whole or not at all.
+    Times keep every digit of their float64. The file appears whole or not at all.
 
     Args:
         path: the file to write; an existing one is replaced.
         trajectory: T_wc [N,7], times [N] in seconds.
         header: begin with a comment line that names the columns.
+        digits: significant ones of a value; 9 hold a millimetre up to a thousand kilometres.
     Raises:
         ValueError: a value is not finite.
         UsageError: the file cannot be written.
@@ -133,7 +135,7 @@ def write_tum(path: Path | str, trajectory: Trajectory, *, header: bool = True) 
     for time, pose in zip(trajectory.times, trajectory.T_wc, strict=True):
         stamp = np.format_float_positional(time, unique=True, trim="k", min_digits=6)
         # Adding zero turns -0.0 into 0.0.
-        values = " ".join(f"{value + 0.0:.9g}" for value in pose.tolist())
+        values = " ".join(f"{value + 0.0:.{digits}g}" for value in pose.tolist())
         lines.append(f"{stamp} {values}\n")
     with atomic_write(Path(path)) as stream:
         stream.write("".join(lines).encode("ascii"))

@@ -203,7 +203,8 @@ class WeightsStore:
         """Check a file on disk: its hash, where one is recorded, and every tensor.
 
         Returns:
-            A sentence about what was checked; a hash that was not recorded is now.
+            A sentence about what was checked; a hash that was not recorded is now, if the folder
+            can be written to.
         Raises:
             InputError: it has changed, is damaged, or is not what its name says.
             UsageError: the name is unknown, or the file is not there.
@@ -220,7 +221,10 @@ class WeightsStore:
         state = self._checked(file, path)
         said = "hash as recorded" if known else "hash recorded now"
         if not known:
-            self._record(file, path, digest, "found in the folder", "")
+            try:
+                self._record(file, path, digest, "found in the folder", "")
+            except UsageError:
+                said = "hash not recorded, since the folder cannot be written to"
         return f"{path.name}: {said}, {len(state)} tensors fit, SHA-256 {digest}"
 
     def _recorded(self, path: Path) -> bool:

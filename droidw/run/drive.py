@@ -306,7 +306,7 @@ class _Run:
             self.events.warn(text)
         truth = source.truth
         if truth is not None:
-            write_tum(self.run_dir / "truth.tum", truth)
+            write_tum(self.run_dir / "truth.tum", truth, digits=15)  # may be in map coordinates
         metrics = self._score(outcome, truth)
         result = RunResult(
             trajectory=outcome.trajectory,

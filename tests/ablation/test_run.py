@@ -107,6 +107,24 @@ def test_a_stop_ends_what_runs_and_writes_the_table(plan, go, started, tmp_path)
     assert (tmp_path / "out" / "report.html").is_file()
 
 
+@pytest.mark.usefixtures("stand_in")
+def test_what_a_stop_leaves_undone_keeps_its_earlier_result(plan, go, started, tmp_path):
+    rows = ["full", "slow", "mute"]
+    before, _ = go(plan(["full", "slow"], sequences=["one"]))
+    place = tmp_path / "out" / "cells" / "slow" / "one" / "seed-0"
+    kept = {path.name: path.read_bytes() for path in place.iterdir() if path.is_file()}
+    count = len(started())
+    stops = iter([False] + [True] * 1000)
+    table, told = go(plan(rows, sequences=["one"]), jobs=1, again=True, stopped=lambda: next(stops))
+    assert states(told, "running") == ["full/one/seed-0"] and len(started()) <= count + 1
+    found = {cell.row: outcome for cell, outcome in table.cells}
+    assert found["slow"] is not None
+    assert found["slow"].metrics == before.cells[1][1].metrics
+    assert found["mute"] is None
+    # Nothing of the call that did not run it.
+    assert {path.name: path.read_bytes() for path in place.iterdir() if path.is_file()} == kept
+
+
 def states_of(started):
     return [name for name in started() if name.startswith("endless")]
 

@@ -75,9 +75,10 @@ def test_pairs_that_cross_in_time_are_left_out() -> None:
     assert found.path_length_est == pytest.approx(found.path_length)  # nowhere to and fro
     assert found.matched == 24
     assert found.notes[0].startswith("3 pairs of stamps cross others in time")
+    three = Trajectory(np.array([0.05, 1.05, 2.05]), whole.T_wc[:3])
     few = Trajectory(np.array([0.9, 1.1, 0.5]), whole.T_wc[:3])
     with pytest.raises(InputError, match="cross others in time") as caught:
-        score(straight([0, 1, 2]), few, max_diff=9)
+        score(three, few, max_diff=9)
     assert "--t-max-diff" in caught.value.hint
 
 

@@ -29,6 +29,14 @@ def test_round_trip_keeps_times_exactly_and_poses_to_nine_digits(tmp_path):
     np.testing.assert_allclose(np.linalg.norm(back.T_wc[:, 3:], axis=1), 1.0, rtol=1e-12)
 
 
+def test_map_coordinates_keep_their_digits_if_asked(tmp_path):
+    trajectory = made_up()
+    trajectory.T_wc[:, :3] += [4.5e5, 5.5e6, 300.0]
+    write_tum(tmp_path / "a.tum", trajectory, digits=15)
+    back = read_tum(tmp_path / "a.tum")
+    np.testing.assert_allclose(back.T_wc[:, :3], trajectory.T_wc[:, :3], rtol=0, atol=1e-8)
+
+
 def test_the_file_has_eight_columns_and_the_same_bytes_every_time(tmp_path):
     write_tum(tmp_path / "a.tum", made_up(), header=False)
     write_tum(tmp_path / "b.tum", made_up(), header=False)

@@ -20,6 +20,7 @@ class Served:
     break_after: list[int] = field(default_factory=list)  # bytes before each broken connection
     status: int = 200
     headers: dict[str, str] = field(default_factory=dict)
+    chunked: bool = False  # sent without its length
     page: str = ""  # sent instead, unless the request carries `confirm=`
 
     @property
@@ -62,7 +63,10 @@ class _Handler(BaseHTTPRequestHandler):
             headers["Content-Range"] = f"bytes {start}-{end}/{len(served.data)}"
         body = served.data[start:]
         keep = served.break_after.pop(0) if served.break_after else None
-        self._send(206 if start else 200, body, headers, keep)
+        if served.chunked:
+            self._send_chunks(206 if start else 200, body, headers, keep)
+        else:
+            self._send(206 if start else 200, body, headers, keep)
 
     def _send(self, status, body, headers, keep=None):
         self.send_response(status)
@@ -74,6 +78,20 @@ class _Handler(BaseHTTPRequestHandler):
         if keep is not None:
             self.wfile.flush()
             self.close_connection = True
+
+    def _send_chunks(self, status, body, headers, keep):
+        self.send_response(status)
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.send_header("Transfer-Encoding", "chunked")
+        self.end_headers()
+        for at in range(0, len(body if keep is None else body[:keep]), 50_000):
+            chunk = body[at : at + 50_000]
+            self.wfile.write(b"%x\r\n" % len(chunk) + chunk + b"\r\n")
+        if keep is None:
+            self.wfile.write(b"0\r\n\r\n")
+        self.wfile.flush()
+        self.close_connection = True
 
 
 class Site:

@@ -43,6 +43,14 @@ def test_a_broken_connection_is_gone_on_with(site, tmp_path):
     assert site.asked("Range") == [None, "bytes=300000-", "bytes=400000-"]
 
 
+@pytest.mark.parametrize("sha256", ["", "of the file"])
+def test_a_file_without_a_length_that_breaks_off_is_not_complete(site, tmp_path, sha256):
+    url = site.serve("/net.pth", DATA, chunked=True, break_after=[300_000, 100_000])
+    wanted = site.files["/net.pth"].sha256 if sha256 else ""
+    assert fetch(url, tmp_path / "net.pth", sha256=wanted).path.read_bytes() == DATA
+    assert site.asked("Range") == [None, "bytes=300000-", "bytes=400000-"]
+
+
 def test_the_next_call_goes_on_where_the_last_stopped(site, tmp_path):
     url = site.serve("/net.pth", DATA, break_after=[200_000])
     with pytest.raises(DownloadError, match="broke after 200000 of 700000 bytes"):

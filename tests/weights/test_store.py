@@ -212,6 +212,19 @@ def test_what_could_be_several_must_be_named(acme, tmp_path):
     assert store.add(path, "acme-twin")[0].name == "acme-twin"
 
 
+def test_verify_of_a_good_file_in_a_folder_that_cannot_be_written(store, tmp_path, monkeypatch):
+    store.add(saved(tmp_path / "x.pth"))
+    (store.folder / "weights.json").unlink()
+
+    def refuse(path):
+        raise UsageError(f"cannot write {path}")
+
+    monkeypatch.setattr("droidw.io.weights_store.atomic_write", refuse)
+    assert "hash not recorded, since the folder cannot be written to, 3" in store.verify(
+        "acme-small"
+    )
+
+
 def test_verify_and_every_later_load_notice_a_change(store, tmp_path):
     _, path = store.add(saved(tmp_path / "x.pth"))
     assert "hash as recorded, 3 tensors fit" in store.verify("acme-small")
