@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from droidw.ablation.plan import Footage, Layer, Measuring, Plan
-from droidw.config.load import YAML_LOADER, load_config, override_layers
+from droidw.config.load import load_config, override_layers
+from droidw.config.reading import YAML_LOADER
 from droidw.config.resolve import ResolvedConfig, choose_preset, resolve
 from droidw.errors import (
     ConfigError,

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from droidw.config.load import Source, read_yaml
 from droidw.config.packaged import packaged_configs, packaged_in
+from droidw.config.reading import Source, read_yaml
 from droidw.errors import ConfigError, UsageError, did_you_mean
 
 __all__ = ["Footage", "Layer", "Measuring", "Plan", "load_plan"]

@@ -88,9 +88,9 @@ def main(args: argparse.Namespace) -> int:
     source, overrides = _split(args.items)
     values = {} if source is None else {"input.source": _in_full(source)}
     if args.calib is not None:
-        values["camera.calib"] = args.calib
+        values["camera.calib"] = _in_full(args.calib)
     if args.masks is not None:
-        values["input.masks"] = args.masks
+        values["input.masks"] = _in_full(args.masks)
     flags = [
         f"{key}={getattr(args, flag)}"
         for flag, key in _FLAGS.items()

@@ -71,6 +71,7 @@ def typed(cls: type, data: Mapping[str, Any], prefix: str, loaded: LoadedConfig)
             "valid: bool, int, float, str, Path, Enum, Literal; lists, tuples and dicts of them",
         ) from error
     try:
+        OmegaConf.set_readonly(defaults, False)  # as it is of a frozen dataclass
         for name, hint in typing.get_type_hints(cls).items():
             if typing.get_origin(hint) is dict and isinstance(data.get(name), Mapping):
                 defaults[name] = {}  # else keys that were taken out would come back

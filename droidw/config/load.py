@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,40 +16,31 @@ from typing import Any
 import yaml
 
 from droidw.config.packaged import packaged_configs, packaged_in
+from droidw.config.reading import (
+    NO_VALUE,
+    YAML_LOADER,
+    Builder,
+    Source,
+    read_yaml,
+    shown,
+    written,
+)
 from droidw.config.schema import DroidwConfig
 from droidw.errors import ConfigError, UsageError, did_you_mean
 from droidw.plugin.registry import SLOTS
 
 __all__ = [
     "LISTED",
-    "YAML_LOADER",
     "LoadedConfig",
-    "Source",
     "load_config",
     "override_layers",
-    "read_yaml",
 ]
 
 LISTED = ("exporters", "observers")
 """Keys that map names of plugins to their options, any number at a time."""
 
-YAML_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""Written in C where PyYAML has it: an ablation reads its files once for every row."""
-
 COMMAND_LINE = "command line"
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)")
 _Tree = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where a value was written: a file and its line (0: unknown), or the command line."""
-
-    file: str
-    line: int = 0
-
-    def __str__(self) -> str:
-        return f"{self.file}:{self.line}" if self.line else self.file
 
 
 @dataclass(frozen=True)
@@ -142,7 +132,6 @@ def override_layers(
 
 
 # A date that is none, a tag that nobody knows, an alias of what it is part of.
-_NO_VALUE = (yaml.YAMLError, ValueError, RecursionError)
 
 
 class _Merger:
@@ -158,7 +147,7 @@ class _Merger:
         real = path.resolve()
         if real in stack:
             chain = " -> ".join(p.name for p in (*stack[stack.index(real) :], real))
-            raise ConfigError(f"{_shown(path)}: extends: the files extend each other: {chain}")
+            raise ConfigError(f"{shown(path)}: extends: the files extend each other: {chain}")
         tree, lines = read_yaml(path)
         extends = tree.pop("extends", [])
         names = [extends] if isinstance(extends, str) else extends
@@ -171,8 +160,8 @@ class _Merger:
             self.add_file(_extended(name, path, lines["extends"]), (*stack, real))
         if _is_table(tree.get("dataset")):  # for readers and `droidw data`, no setting of a run
             del tree["dataset"]
-        self.files.append(_shown(path))
-        self.merge(self.data, tree, "", {"": Source(_shown(path)), **lines})
+        self.files.append(shown(path))
+        self.merge(self.data, tree, "", {"": Source(shown(path)), **lines})
 
     def add_dataset(self, source: str, preset: str | None) -> None:
         """Merge the settings of the dataset, and of the sequence, that a source names."""
@@ -184,12 +173,12 @@ class _Merger:
         table = tree.pop("dataset", None)
         if not _is_table(table) or preset not in table.get("presets", []):
             return
-        shown = _shown(path)
-        self.files.append(shown)
-        self.merge(self.data, tree, "", {"": Source(shown), **lines})
+        file = shown(path)
+        self.files.append(file)
+        self.merge(self.data, tree, "", {"": Source(file), **lines})
         for key, row in table["sequences"].items():
             if row and name in (key, *row.get("also", ())):
-                at = lines.get(f"dataset.sequences.{key}", Source(shown))
+                at = lines.get(f"dataset.sequences.{key}", Source(file))
                 self.merge(self.data, row.get("run", {}), "", {"": at})
 
     def merge(
@@ -225,7 +214,7 @@ class _Merger:
         value = {"name": value} if isinstance(value, str) else value
         if not isinstance(value, Mapping):
             raise ConfigError(
-                f"{where}: {slot}: {_yaml(value)} is not the name of a plugin",
+                f"{where}: {slot}: {written(value)} is not the name of a plugin",
                 f"write {slot}: NAME, or {slot}: {{name: NAME, options: {{...}}}}; "
                 "what is to be off is called none\n"
                 f"see: droidw list-plugins --kind {slot}",
@@ -237,7 +226,7 @@ class _Merger:
             name_source = lines.get(f"{slot}.name", where)
             if not isinstance(name, str):
                 raise ConfigError(
-                    f"{name_source}: {slot}.name: {_yaml(name)} is not the name of a plugin",
+                    f"{name_source}: {slot}.name: {written(name)} is not the name of a plugin",
                     f"see: droidw list-plugins --kind {slot}",
                 )
             if name != current["name"]:
@@ -272,15 +261,15 @@ def _override(text: str) -> tuple[list[str], Any]:
         )
     try:
         node = yaml.compose(value, Loader=YAML_LOADER)
-        found = None if node is None else _Builder(COMMAND_LINE).value(node, "")
-    except _NO_VALUE as error:
+        found = None if node is None else Builder(COMMAND_LINE).value(node, key.strip())
+    except NO_VALUE as error:
         raise UsageError(
             f"{COMMAND_LINE}: {key}: the value {value!r} is not YAML: "
             + " ".join(str(error).split()),
             "quote it for the shell and for YAML, for example: 'input.source=\"a: b\"'",
         ) from error
     # In a file that may be a list whose lines are all commented out; typed it means none of them.
-    return path, [] if found is None and key.strip() in LISTED else found
+    return path, found if found or key.strip() not in LISTED else []
 
 
 def _nested(path: Sequence[str], value: Any) -> _Tree:
@@ -315,76 +304,3 @@ def _extended(name: str, file: Path, where: Source) -> Path:
         did_you_mean(name, packaged)
         + f"packaged: {', '.join(packaged)}\nor a path relative to {file.parent or '.'}",
     )
-
-
-def _shown(path: Path) -> str:
-    """A path as short as it can be told: relative to where the user stands."""
-    try:
-        return str(path.resolve().relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
-
-
-def read_yaml(path: Path) -> tuple[_Tree, dict[str, Source]]:
-    """The mapping in a YAML file, and where each full key is written.
-
-    Numbers such as 1e-3 are numbers, and a key that is written twice is refused.
-
-    Raises:
-        ConfigError: the file cannot be read, or holds no mapping.
-    """
-    shown = _shown(path)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise ConfigError(f"{shown}: there is no such configuration file") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{shown}: cannot be read: {error}") from error
-    try:
-        node = yaml.compose(text, Loader=YAML_LOADER)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{shown}: is not YAML: " + " ".join(str(error).split())) from error
-    if node is None:
-        return {}, {}
-    if not isinstance(node, yaml.MappingNode):
-        raise ConfigError(f"{shown}: a configuration holds `key: value` lines, not a bare value")
-    builder = _Builder(shown)
-    try:
-        return builder.value(node, ""), builder.lines
-    except _NO_VALUE as error:
-        last = next(reversed(builder.lines.values()), None)
-        told = " ".join(str(error).split())
-        raise ConfigError(f"{last or shown}: holds what is no value: {told}") from error
-
-
-class _Builder:
-    """Plain values out of YAML nodes, noting the line of every key; doubled keys are refused."""
-
-    def __init__(self, shown: str) -> None:
-        self.shown = shown
-        self.lines: dict[str, Source] = {}
-        self._loader = yaml.SafeLoader("")
-
-    def value(self, node: yaml.Node, prefix: str) -> Any:
-        if not isinstance(node, yaml.MappingNode):
-            value = self._loader.construct_object(node, deep=True)
-            # YAML 1.1 takes 1e-3 for text
-            plain = isinstance(node, yaml.ScalarNode) and not node.style
-            if plain and isinstance(value, str) and _NUMBER.fullmatch(value):
-                return float(value)
-            return value
-        tree: _Tree = {}
-        for key_node, value_node in node.value:
-            key = str(key_node.value)
-            full = f"{prefix}.{key}" if prefix else key
-            source = Source(self.shown, key_node.start_mark.line + 1)
-            if key in tree:
-                raise ConfigError(f"{source}: {full}: is written twice in this file")
-            self.lines[full] = source
-            tree[key] = self.value(value_node, full)
-        return tree
-
-
-def _yaml(value: Any) -> str:
-    """A value as it would stand in a YAML file."""
-    return str(yaml.safe_dump(value, default_flow_style=True)).removesuffix("...\n").strip()

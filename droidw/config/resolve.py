@@ -15,9 +15,10 @@ import yaml
 
 from droidw.config.check import check_keys, check_ranges, typed
 from droidw.config.inert import check_inert
-from droidw.config.load import COMMAND_LINE, LISTED, LoadedConfig, Source, load_config
+from droidw.config.load import COMMAND_LINE, LISTED, LoadedConfig, load_config
 from droidw.config.packaged import packaged_in
 from droidw.config.plain import plain
+from droidw.config.reading import Source
 from droidw.config.schema import DroidwConfig
 from droidw.errors import (
     ConfigError,
@@ -88,7 +89,11 @@ class ResolvedConfig:
             f"# {key}: {entry.component.name}, from {entry.origin}"
             for key, entry in self.origins.items()
         ]
-        body = yaml.safe_dump(plain(self.config), sort_keys=False, allow_unicode=True)
+        tree = plain(self.config)
+        for section in LISTED:  # what is off has to be said, or the defaults would come back
+            usual = dict.fromkeys(getattr(DroidwConfig(), section))
+            tree[section] = {**usual, **tree[section]}
+        body = yaml.safe_dump(tree, sort_keys=False, allow_unicode=True)
         return "\n".join(lines) + "\n" + str(body)
 
 

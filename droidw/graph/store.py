@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from droidw.errors import PluginError
 from droidw.geometry.camera import Grid
 from droidw.geometry.transfer import upload
 from droidw.interfaces.uncertainty import StoreField
@@ -96,7 +97,11 @@ class KeyframeStore:
         sizes = {"h": grid.height, "w": grid.width, "c": feature_dim}
         for declared in (*core, *fields):
             if declared.name in self._declared:
-                raise ValueError(f"the store field '{declared.name}' is declared twice")
+                raise PluginError(
+                    f"the uncertainty model breaks its contract: the store field "
+                    f"'{declared.name}' is there already",
+                    f"give it a name of its own; taken: {', '.join(self._declared)}",
+                )
             self._declared[declared.name] = declared
         self._data: dict[str, Tensor] = {}
         for name, declared in self._declared.items():

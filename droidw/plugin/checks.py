@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import sys
+import typing
 import zlib
 from collections.abc import Collection, Iterable
 from importlib import util
@@ -54,8 +55,10 @@ def problem_of(item: object) -> str:
     if not isinstance(item, Component):
         return f"yielded {_described(item)} where a droidw.Component is expected"
     record: Any = item  # what its fields are declared as is what is to be checked
-    if not _NAME.fullmatch(str(record.name)):
+    if not isinstance(record.name, str) or not _NAME.fullmatch(record.name):
         return f"the name {record.name!r} is not lower-case kebab, such as 'my-part'"
+    if not isinstance(record.summary, str) or len(record.summary.splitlines()) > 1:
+        return f"'{record.name}': summary is {record.summary!r}, not one line of text"
     if not callable(record.factory):
         return f"'{record.name}': factory is {_described(record.factory)}, not callable"
     if not isinstance(record.options, type) or not dataclasses.is_dataclass(record.options):
@@ -64,12 +67,31 @@ def problem_of(item: object) -> str:
         missing = dataclasses.MISSING
         if entry.default is missing and entry.default_factory is missing:
             return f"'{record.name}': option '{entry.name}' has no default"
+    problem = _problem_of_options(record.options)
+    if problem:
+        return f"'{record.name}': options {record.options.__name__}: {problem}"
     for attribute in ("requires", "capabilities"):
         value = getattr(record, attribute)
         several = isinstance(value, Collection) and not isinstance(value, str)
         if not several or not all(isinstance(part, str) for part in value):
             return f"'{record.name}': {attribute} is {value!r}, not a collection of strings"
     return _problem_of_weights(record)
+
+
+def _problem_of_options(options: type) -> str:
+    try:
+        typing.get_type_hints(options)
+    except Exception as error:  # noqa: BLE001 - strangers' code
+        return f"a type cannot be looked up when it runs ({error})"
+    try:
+        options()
+    except Exception as error:  # noqa: BLE001 - strangers' code
+        return f"its defaults are refused: {type(error).__name__}: {error}"
+    texts = ((entry.name, entry.metadata.get("help", "")) for entry in dataclasses.fields(options))
+    for name, text in texts:
+        if not isinstance(text, str):
+            return f"the help of '{name}' is {text!r}, not text"
+    return ""
 
 
 def _problem_of_weights(record: Any) -> str:

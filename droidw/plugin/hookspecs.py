@@ -10,7 +10,8 @@ by an entry point of group `droidw` in an installed package::
     [project.entry-points.droidw]
     acme = "droidw_acme.plugin"
 
-or by `droidw run ... --plugin path/to/file.py`, or by `droidw.register(module)` from Python.
+or by `droidw run ... --plugin path/to/file.py`, or from Python by
+`plugins = droidw.register(module)`.
 """
 
 from __future__ import annotations

@@ -206,8 +206,11 @@ class Plugins:
 
     def _register(self, plugin: object, origin: _Origin) -> Failure | None:
         """Hand a plugin to pluggy, ask its hooks, check the answers; all of it or nothing."""
+        name = f"{origin.distribution}:{origin.plugin}"
+        if self._manager.has_plugin(name) or self._manager.is_registered(plugin):
+            return self._fail(origin, "it is registered already: was it given twice?")
         try:
-            self._manager.register(plugin, name=f"{origin.distribution}:{origin.plugin}")
+            self._manager.register(plugin, name=name)
             self._manager.check_pending()
             entries = self._collect(plugin, origin)
         except pluggy.PluginValidationError as error:
@@ -216,8 +219,6 @@ class Plugins:
         except PluginError as error:
             self._drop(plugin)
             return self._fail(origin, str(error))
-        except ValueError as error:  # pluggy: the same plugin or name a second time
-            return self._fail(origin, f"it is registered already ({error})")
         except Exception as error:  # noqa: BLE001 - strangers' code
             self._drop(plugin)
             return self._fail(origin, f"{type(error).__name__}: {error}", _trace(error))

@@ -181,11 +181,16 @@ class Registry:
             )
         if len(found) > 1:
             origins = [f"{e.origin} (plugin '{e.plugin}')" for e in found]
+            # What comes with droidw is more than this name, and a file is not switched off by one.
+            others = [e for e in found if e.distribution != "droidw" and e.version]
+            advice = "give it another name, or leave out its file (--plugin)"
+            if others:
+                advice = f"switch one off: DROIDW_DISABLE_PLUGINS={others[-1].plugin}"
             raise PluginError(
                 f"the {self.kind.noun} '{name}' is offered by "
                 + " and by ".join(origins)
                 + "; a name must be unique within its kind",
-                f"switch one off: DROIDW_DISABLE_PLUGINS={found[-1].plugin}",
+                advice,
             )
         return found[0]
 
@@ -302,6 +307,7 @@ def _unavailable(component: Component[Any]) -> str:
     if component.available is None:
         return ""
     try:
-        return component.available()
-    except Exception as error:  # noqa: BLE001 - strangers' code
+        why: object = component.available()
+    except (Exception, SystemExit) as error:  # noqa: BLE001 - strangers' code
         return f"its check raised {type(error).__name__}: {error}"
+    return why if isinstance(why, str) else f"its check returned {why!r}, not why it cannot run"

@@ -30,9 +30,10 @@ from droidw.run.cameras import choose_camera, inputs_of, open_masks, why_unmatch
 from droidw.run.folder import RunFolder, listed, prepare
 from droidw.run.machine import run_device, settle
 from droidw.run.manifest import facts_of_setup, facts_of_time, facts_of_tracking, told
-from droidw.run.parts import build_parts
+from droidw.run.parts import build_observers, build_parts
 from droidw.run.signals import Stop
 from droidw.run.sources import could_not_be_used, open_source
+from droidw.slam.contract import frame_of
 from droidw.slam.frame import RunResult
 from droidw.slam.records import Outcome
 from droidw.slam.system import SlamSystem
@@ -117,12 +118,10 @@ class _Run:
             disabled=plugins.disabled(),
         )
         settle(self.config.seed, self.config.threads)
-        self.events = Dispatcher(
-            [
-                (part.name, part.factory(options, self.context))
-                for part, options in resolved.observers
-            ]
-        )
+        observers, failed = build_observers(resolved, self.context)
+        self.events = Dispatcher(observers)
+        for text in failed:
+            self.events.warn(text)
 
     def go(self) -> RunResult:
         try:
@@ -140,7 +139,7 @@ class _Run:
                 f"{self.config.input.source}: no picture could be read",
                 "\n".join(source.problems[:5]) or "see: droidw run -h",
             )
-        height, width = first.image.shape[:2]
+        height, width = frame_of(first).image.shape[:2]
         camera, self.said, guessed = choose_camera(
             self.config.camera, source.camera, width, height, source.name
         )
@@ -214,10 +213,12 @@ class _Run:
 
     def _prepared(self, pictures: Iterable[RawFrame], rectify: Rectifier) -> Iterator[Frame]:
         """Frames at working size; what decoding takes is counted in the thread that decodes."""
-        pending = iter(pictures)
+        pending, before = iter(pictures), None
         while True:
             with self.clock("decode"):
                 raw = next(pending, None)
+                if raw is not None:
+                    before = frame_of(raw, before)
                 frame = None if raw is None else self._rectified(raw, rectify)
                 if frame is not None and self.device.type == "cuda":
                     frame = replace(frame, image=frame.image.pin_memory())

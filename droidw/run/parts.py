@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any
 
 from droidw.errors import PluginError
@@ -15,9 +16,12 @@ from droidw.slam.optimise import Parts
 
 if TYPE_CHECKING:
     from droidw.config.resolve import ResolvedConfig
+    from droidw.interfaces.observers import Observer
     from droidw.plugin.component import BuildContext, Component
 
-__all__ = ["build_parts"]
+__all__ = ["build_observers", "build_parts"]
+
+_log = logging.getLogger("droidw.run.drive")
 
 _PROTOCOLS: dict[str, type] = {
     "features": FeatureExtractor,
@@ -39,6 +43,24 @@ def build_parts(resolved: ResolvedConfig, context: BuildContext) -> Parts:
     """
     made = {kind: _made(kind, *resolved.parts[kind], context) for kind in _PROTOCOLS}
     return Parts(**made)
+
+
+def build_observers(
+    resolved: ResolvedConfig, context: BuildContext
+) -> tuple[list[tuple[str, Observer]], list[str]]:
+    """The chosen observers by name, and a sentence of each that could not be made.
+
+    They only look on: one that fails costs nothing but itself.
+    """
+    made: list[tuple[str, Observer]] = []
+    failed: list[str] = []
+    for component, options in resolved.observers:
+        try:
+            made.append((component.name, component.factory(options, context)))
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - strangers' code
+            _log.debug("observer %s raised", component.name, exc_info=True)
+            failed.append(f"observer '{component.name}' failed: {type(error).__name__}: {error}")
+    return made, failed
 
 
 def _made(kind: str, component: Component[Any], options: Any, context: BuildContext) -> Any:

@@ -42,21 +42,32 @@ def open_source(
         component, options = resolved.parts["reader"]
         chosen: DatasetReader = component.factory(options, context)
         return chosen.open(given.source, selection)
-    registry = plugins.registry("reader")
+    registry, left_out = plugins.registry("reader"), []
     for name in registry.names():
-        if registry.status(name) != "ready":
+        status = registry.status(name)
+        if status != "ready":
+            left_out += [f"'{name}' ({status})"] if "clash" in status else []
             continue
-        component = registry.get(name)
-        reader: DatasetReader = component.factory(component.options(), context)
-        if reader.recognises(given.source):
+        entry = registry.entry(name)
+        try:
+            reader: DatasetReader = entry.component.factory(entry.component.options(), context)
+            known = bool(reader.recognises(given.source))
+        except Exception as error:  # noqa: BLE001 - nobody chose it
+            why = f"{entry.origin}: {type(error).__name__}: {error}"
+            left_out.append(f"'{name}' ({why})")
+            _log.warning("reader '%s' was left out: %s", name, why)
+            continue
+        if known:
             _log.info(f"reader: {name}")
             return reader.open(given.source, selection)
-    raise _unknown(given.source, registry.names())
+    raise _unknown(given.source, registry.names(), left_out)
 
 
-def _unknown(source: str, readers: list[str]) -> InputError:
+def _unknown(source: str, readers: list[str], left_out: list[str]) -> InputError:
     """What to say of a source that nobody recognises."""
     choose = f"readers: {', '.join(readers)}   (choose one with reader=NAME)"
+    if left_out:
+        choose += f"\nleft out: {', '.join(left_out)}"
     parted = split_source(source)
     if parted is not None:
         names = sorted({*table_names(), *readers})

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from droidw.geometry.transfer import upload
 from droidw.interfaces.features import KnowsMovable
-from droidw.slam.contract import depth_of, features_of
+from droidw.slam.contract import depth_of, features_of, movable_of
 from droidw.solve.weights import unmasked
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class CellMaps:
             return None
         with self._clock("features"):
             image = upload(frame.image, self._device)
-            return extractor.movable(image, self._picked)
+            return movable_of(extractor.movable(image, self._picked), self._picked)
 
     def prior(self, frame: Frame) -> Tensor:
         """[h,w] inverse depth, 0 where it is not known."""

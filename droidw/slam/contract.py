@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,6 +14,7 @@ from droidw.errors import PluginError
 from droidw.interfaces.correspondence import EdgeUpdate
 from droidw.interfaces.depth import DepthMap
 from droidw.interfaces.uncertainty import UncertaintyReport
+from droidw.slam.frame import RawFrame
 from droidw.solve.problem import Step
 
 if TYPE_CHECKING:
@@ -19,7 +22,9 @@ if TYPE_CHECKING:
     from droidw.interfaces.correspondence import EdgeRequest
     from droidw.solve.problem import BAProblem
 
-__all__ = ["depth_of", "energy_of", "features_of", "step_of", "update_of"]
+__all__ = [
+    "depth_of", "energy_of", "features_of", "frame_of", "movable_of", "step_of", "update_of",
+]  # fmt: skip
 
 _MORE = "; the checks in droidw.testing find more (docs/plugins.md)"
 
@@ -28,7 +33,8 @@ def features_of(found: object, dim: int, grid: Grid) -> Tensor:
     """The maps that a feature extractor gives of a frame.
 
     Raises:
-        PluginError: they are no tensor [dim,h,w] on the grid.
+        PluginError: they are no tensor [dim,h,w] on the grid, or not finite (which is asked on a
+            CPU alone: a GPU would have to be waited for).
     """
     wanted = (dim, grid.height, grid.width)
     if not isinstance(found, Tensor) or tuple(found.shape) != wanted:
@@ -38,7 +44,69 @@ def features_of(found: object, dim: int, grid: Grid) -> Tensor:
             "return one value per cell and channel: grid.sample(map) reads a map at the cells"
             + _MORE,
         )
+    if found.device.type == "cpu" and not _finite(found):
+        raise PluginError(
+            "the feature extractor breaks its contract: `extract` returned values that are not "
+            "finite",
+            "look for a division by 0, or values beyond half precision" + _MORE,
+        )
     return found
+
+
+def movable_of(found: object, grid: Grid) -> Tensor:
+    """The map [h,w] in [0,1] that an extractor gives of what can move.
+
+    Raises:
+        PluginError: it is no such tensor (values are looked at on a CPU alone).
+    """
+    wanted = (grid.height, grid.width)
+    fits = isinstance(found, Tensor) and tuple(found.shape) == wanted
+    if not isinstance(found, Tensor) or not fits or not found.is_floating_point():
+        said = _told(found)
+    elif found.device.type != "cpu" or bool(((found >= 0) & (found <= 1)).all()):
+        return found.to(torch.float32)
+    else:
+        said = "values outside [0, 1]"
+    raise PluginError(
+        f"the feature extractor breaks its contract: `movable` returned {said}, not a tensor "
+        f"{list(wanted)} of shares in [0, 1]",
+        "return one share per cell of the grid" + _MORE,
+    )
+
+
+def frame_of(found: object, before: RawFrame | None = None) -> RawFrame:
+    """The next raw picture of a reader.
+
+    Args:
+        found: what came. before: the picture before it.
+    Raises:
+        PluginError: it is no RawFrame of uint8 [H,W,3] with a finite time, or its time or index is
+            not larger than those before.
+    """
+    if not isinstance(found, RawFrame):
+        said = f"{type(found).__name__}, no RawFrame"
+    elif not _is_picture(found.image):
+        kind = getattr(found.image, "dtype", "")
+        said = f"a picture that is {_told(found.image)} {kind}".rstrip() + ", not uint8 [H,W,3]"
+    elif not math.isfinite(found.time):
+        said = f"the time {found.time}"
+    elif before is not None and not (found.time > before.time and found.index > before.index):
+        said = (
+            f"picture {found.index} at {found.time:.10g} s after picture {before.index} at "
+            f"{before.time:.10g} s"
+        )
+    else:
+        return found
+    raise PluginError(
+        f"the reader breaks its contract: `frames` gave {said}",
+        "give RGB pictures of whole numbers, with times in seconds and indices that rise" + _MORE,
+    )
+
+
+def _is_picture(image: object) -> bool:
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        return False
+    return image.ndim == 3 and image.shape[2] == 3
 
 
 def depth_of(found: object, height: int, width: int) -> Tensor | None:

@@ -347,3 +347,13 @@ def test_packaged_ablations_resolve(name, plugins, tmp_path):
         assert name == "paper"  # its parts want weights, which no test has
         return
     assert cells and {cell.row for cell in cells} == set(found.rows)
+
+
+def test_sequences_whose_names_are_digits(tmp_path):
+    for name in ("00", "010", "08"):
+        (tmp_path / "data" / name).mkdir(parents=True)
+    file = tmp_path / "a.yaml"
+    file.write_text("preset: cpu\ndata: data\nsequences: [00, 010, 08]\nrows: {full: {}}\n")
+    assert list(load_plan(str(file)).sequences) == ["00", "010", "08"]
+    file.write_text("preset: cpu\ndata: data\nsequences: {a: {source: 010}}\nrows: {full: {}}\n")
+    assert Path(load_plan(str(file)).sequences["a"].source).name == "010"

@@ -46,6 +46,11 @@ class TextOptions:
 
 
 @dataclass(frozen=True)
+class MappedOptions:
+    scale: dict[str, float] = field(default_factory=lambda: {"near": 1.0})
+
+
+@dataclass(frozen=True)
 class OddOptions:
     stream: object = field(default=None)
     call: type(print) = print
@@ -84,6 +89,7 @@ def plugins():
         ("exporter", part("ply", TextOptions)),
         ("exporter", part("uncertainty")),
         ("exporter", part("depth")),
+        ("exporter", part("mapped", MappedOptions)),
         ("observer", part("progress")),
         ("observer", part("report")),
     ]:

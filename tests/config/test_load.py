@@ -179,12 +179,12 @@ def test_overrides_that_are_refused():
     )
     assert "is not key=value" in refusal(overrides=["a..b=1"], error=UsageError)
     assert "is not YAML" in refusal(overrides=["seed=[1"], error=UsageError)
-    said = refusal(overrides=["camera.calib=2024-13-45"], error=UsageError)
-    assert "camera.calib: the value '2024-13-45' is not YAML: month must be in 1..12" in said
+    said = refusal(overrides=["camera.long_side=2024-13-45"], error=UsageError)
+    assert "camera.long_side: the value '2024-13-45' is not YAML: month must be in 1..12" in said
 
 
 @pytest.mark.parametrize(
-    "text", ["seed: 1\ninput: {source: 2024-13-01}\n", "seed: !foo 3\n", "camera: &a {x: *a}\n"]
+    "text", ["seed: 1\ncamera: {long_side: 2024-13-01}\n", "seed: !foo 3\n", "camera: &a {x: *a}\n"]
 )
 def test_values_that_are_none(write, text):
     assert "holds what is no value: " in refusal([write("mine.yaml", text)])

@@ -11,7 +11,7 @@ import yaml
 
 import droidw
 from droidw.config.load import load_config
-from droidw.config.resolve import choose_preset, resolve
+from droidw.config.resolve import choose_preset, needs_preset, resolve
 from droidw.config.schema import DroidwConfig
 from droidw.errors import ConfigError, MissingRequirementError, PluginError
 from droidw.plugin.registry import PluginNotFound
@@ -59,6 +59,47 @@ def test_round_trip(resolved, tmp_path):
     assert second.to_yaml() == first.to_yaml()
     assert yaml.safe_load(first.to_yaml())["uncertainty"]["options"]["taps"] == [1, 2]
     assert "# ba: auto, from registered from Python" in first.to_yaml()
+
+
+@pytest.mark.parametrize(
+    ("override", "kept"),
+    [
+        ("exporters=null", []),
+        ("exporters={}", []),
+        ("exporters=[mapped]", ["mapped"]),
+        ("exporters.ply=null", ["trajectory", "uncertainty", "depth"]),
+    ],
+)
+def test_what_is_off_stays_off_in_what_is_kept_of_a_run(resolved, tmp_path, override, kept):
+    first = resolved(override, "observers=null", "input.source=x")
+    path = tmp_path / "config.yaml"
+    path.write_text(first.to_yaml())
+    second = resolved(files=[path])
+    assert [part.name for part, _ in first.exporters] == kept
+    assert [part.name for part, _ in second.exporters] == kept
+    assert second.observers == first.observers == ()
+    assert not needs_preset([path])
+    assert second.to_yaml() == first.to_yaml()
+
+
+def test_a_mapping_of_options_is_what_it_is_said_to_be(resolved, tmp_path):
+    first = resolved("exporters={mapped: {scale: {far: 2, near: 3}}}")
+    assert first.exporters[-1][1].scale == {"far": 2.0, "near": 3.0}
+    path = tmp_path / "config.yaml"
+    path.write_text(resolved("exporters=[mapped]").to_yaml())
+    assert resolved(files=[path]).exporters[-1][1].scale == {"near": 1.0}
+    path.write_text("exporters: {mapped: {scale: {far: 2}}}")  # keys that are left out are gone
+    assert resolved(files=[path]).exporters[-1][1].scale == {"far": 2.0}
+    with pytest.raises(ConfigError, match="scale"):
+        resolved("exporters.mapped.scale={far: deep}")
+
+
+def test_names_of_digits_are_names(resolved, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text("input: {source: 010, masks: 12:30}\ncamera: {calib: null}\n")
+    config = resolved(files=[path]).config
+    assert (config.input.source, config.input.masks, config.camera.calib) == ("010", "12:30", None)
+    assert resolved("input.source=00").config.input.source == "00"
 
 
 PHASES = ", ".join(DroidwConfig().schedule)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from droidw.errors import PluginError
 from droidw.geometry.camera import Grid
 from droidw.graph.store import KeyframeInfo, KeyframeStore
 from droidw.interfaces.uncertainty import StoreField
@@ -110,7 +111,7 @@ def test_removing_what_is_not_there(at):
 
 
 def test_two_fields_of_one_name():
-    with pytest.raises(ValueError, match="declared twice"):
+    with pytest.raises(PluginError, match="is there already"):
         KeyframeStore(GRID, torch.ones(4), 0, (StoreField("disps", ("h",)),))
 
 

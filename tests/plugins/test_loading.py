@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 import types
@@ -11,6 +12,7 @@ import pytest
 
 import droidw
 from droidw.errors import MissingRequirementError, PluginError, UsageError, nearest
+from droidw.plugin.checks import problem_of
 from droidw.plugin.registry import KINDS, PluginNotFound
 
 SOUND = """
@@ -109,6 +111,80 @@ def test_name_clash_names_both_distributions(acme, other):
     )
     settled = droidw.load_plugins(environ={"DROIDW_DISABLE_PLUGINS": "other"})
     assert settled.registry("features").entry("acme").origin == "droidw-acme 1.2"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Unreadable:
+    helped: int = dataclasses.field(default=1, metadata={"help": None})
+
+
+@dataclasses.dataclass(frozen=True)
+class _Refused:
+    count: int = 0
+
+    def __post_init__(self):
+        raise ValueError("never")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Unknown:
+    path: "Nowhere" = None  # noqa: F821, UP037
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"name": 5}, "the name 5 is not lower-case kebab"),
+        ({"summary": None}, "summary is None, not one line of text"),
+        ({"summary": "slow,\nbut sure"}, "not one line of text"),
+        ({"options": _Unreadable}, "the help of 'helped' is None, not text"),
+        ({"options": _Refused}, "its defaults are refused: ValueError: never"),
+        ({"options": _Unknown}, "a type cannot be looked up"),
+    ],
+)
+def test_records_that_would_break_lists_for_all_are_refused(changes, said):
+    assert said in problem_of(dataclasses.replace(component(), **changes))
+
+
+def test_a_hook_that_raises_is_told_as_it_says(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import droidw\n@droidw.hookimpl\ndef droidw_depth_priors():\n"
+        "    raise ValueError('no sensor')\n"
+    )
+    with pytest.raises(PluginError, match="ValueError: no sensor"):
+        droidw.load_plugins([file])
+
+
+def leave():
+    raise SystemExit(3)
+
+
+@pytest.mark.parametrize(
+    ("available", "said"),
+    [
+        (lambda: True, "its check returned True, not why it cannot run"),
+        (lambda: None, "its check returned None"),
+        (leave, "its check raised SystemExit: 3"),
+    ],
+)
+def test_checks_that_answer_no_text(available, said):
+    plugins = droidw.register(features=component(available=available))
+    assert said in plugins.registry("features").status("mine")
+    with pytest.raises(MissingRequirementError, match="cannot run here: its check"):
+        plugins.registry("features").require("mine")
+
+
+def test_what_comes_with_droidw_is_not_what_to_switch_off_at_a_clash(tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text(
+        "import droidw\n@droidw.hookimpl\ndef droidw_depth_priors():\n"
+        "    yield droidw.Component('file', 'mine', lambda o, c: None)\n"
+    )
+    with pytest.raises(PluginError, match="'file' is offered by") as caught:
+        droidw.load_plugins([file]).registry("depth").get("file")
+    assert "DROIDW_DISABLE_PLUGINS" not in caught.value.hint
+    assert "give it another name" in caught.value.hint
 
 
 def test_strict_raises_on_a_clash():

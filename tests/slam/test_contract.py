@@ -1,17 +1,20 @@
-"""What bundle adjustment and correspondence answer, held to their protocols."""
+"""What parts answer and readers deliver, held to their protocols."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 from droidw.errors import PluginError
+from droidw.geometry.camera import Grid
 from droidw.geometry.projective import reproject
 from droidw.interfaces.correspondence import EdgeRequest, EdgeUpdate
-from droidw.slam.contract import step_of, update_of
+from droidw.slam.contract import features_of, frame_of, movable_of, step_of, update_of
+from droidw.slam.frame import RawFrame
 from droidw.slam.stepping import stepped
 from droidw.solve.problem import BAProblem, Report, Step
 from droidw_plugins.bundle.torch_ba import TorchBundleAdjuster
@@ -120,3 +123,55 @@ def test_answers_of_correspondence_that_are_none(found, said):
         update_of(found, request)
     sound = EdgeUpdate(zeros(E, H, W, 2), zeros(E, H, W, 2))
     assert update_of(sound, request) is sound
+
+
+GRID = Grid(H, W, 8, 3.5)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_features_that_are_not_finite_are_those_of_the_extractor(value):
+    found = zeros(4, H, W)
+    assert features_of(found, 4, GRID) is found
+    found[1, 2, 3] = value
+    with pytest.raises(PluginError, match=r"feature extractor breaks.*not finite"):
+        features_of(found, 4, GRID)
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (None, "NoneType"),
+        (np.zeros((H, W), np.float32), "ndarray"),
+        (zeros(W, H), r"a tensor \[12, 8\], not a tensor \[8, 12\]"),
+        (zeros(H, W, dtype=torch.int64), "a torch.int64 tensor"),
+        (zeros(H, W) + 200, r"values outside \[0, 1\]"),
+        (zeros(H, W) + float("nan"), r"values outside \[0, 1\]"),
+    ],
+)
+def test_what_can_move_is_a_share_of_each_cell(found, said):
+    with pytest.raises(PluginError, match="feature extractor breaks.*`movable` returned " + said):
+        movable_of(found, GRID)
+    assert movable_of(zeros(H, W, dtype=torch.float64), GRID).dtype == torch.float32
+
+
+def raw(index, time, image=None):
+    picture = np.zeros((H, W, 3), np.uint8) if image is None else image
+    return RawFrame(index, time, picture, str(index))
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (None, "NoneType, no RawFrame"),
+        (raw(1, 1.0, np.zeros((H, W, 3), np.float32)), r"ndarray \[8, 12, 3\] float32, not uint8"),
+        (raw(1, 1.0, np.zeros((H, W), np.uint8)), r"ndarray \[8, 12\] uint8, not uint8 \[H,W,3\]"),
+        (raw(1, float("nan")), "the time nan"),
+        (raw(1, 0.5), "picture 1 at 0.5 s after picture 0 at 0.5 s"),
+        (raw(0, 1.0), "picture 0 at 1 s after picture 0 at 0.5 s"),
+    ],
+)
+def test_pictures_of_a_reader_that_are_none(found, said):
+    with pytest.raises(PluginError, match="reader breaks its contract: `frames` gave .*" + said):
+        frame_of(found, raw(0, 0.5))
+    sound = raw(1, 0.6)
+    assert frame_of(sound, raw(0, 0.5)) is sound and frame_of(sound) is sound

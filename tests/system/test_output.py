@@ -256,6 +256,41 @@ def test_a_part_that_breaks_while_tracking_keeps_what_was_tracked(go, footage, p
     assert len(ran.poses) == ran.manifest["frames"]
 
 
+BROKEN_READERS = """
+import droidw
+
+class Nosy:
+    def recognises(self, source):
+        return open(source + "/acme.json").read() != ""
+
+def burnt(options, context):
+    raise RuntimeError("the lens is cracked")
+
+@droidw.hookimpl
+def droidw_dataset_readers():
+    yield droidw.Component("aa-nosy", "raises where it looks", lambda o, c: Nosy())
+    yield droidw.Component("aa-burnt", "cannot be made", burnt)
+
+@droidw.hookimpl
+def droidw_observers():
+    yield droidw.Component("unborn", "cannot be made", burnt)
+"""
+
+
+def test_readers_that_nobody_chose_and_observers_cost_nothing(go, footage, plugin, tmp_path):
+    path = plugin(BROKEN_READERS)
+    ran = go(footage(count=14).folder, "--plugin", path, "observers.unborn={}")
+    assert ran.code == 0, ran.err
+    assert len(ran.poses) == 14
+    assert "observer 'unborn' failed: RuntimeError: the lens is cracked" in ran.warnings
+    log = (ran.folder / "log.txt").read_text()
+    assert "reader 'aa-nosy' was left out" in log and "the lens is cracked" in log
+    notes = tmp_path / "notes.txt"
+    notes.write_text("words")
+    refused = go(notes, "--plugin", path, to="refused")
+    assert refused.code == 3 and "left out: 'aa-burnt' (" in refused.err
+
+
 NONSENSE = """
 import droidw
 from droidw.interfaces.uncertainty import UncertaintyReport
