@@ -14,7 +14,7 @@ __all__ = ["BackendConfig"]
 class BackendConfig:
     """Global bundle adjustment after tracking."""
 
-    passes: list[int] = opt([2, 2, 2, 2, 2], "update steps of each global pass")
+    passes: list[int] = opt([2, 2, 2, 2, 2], "update steps of each global pass", ge=1)
     more_passes: int = opt(
         4,
         "times that the last pass is made again at most, if `edges_hidden` is reached, while it "

@@ -121,6 +121,11 @@ class KeyframeStore:
         return self._data[name][: len(self.infos)]
 
     @property
+    def names(self) -> frozenset[str]:
+        """Of all fields."""
+        return frozenset(self._declared)
+
+    @property
     def T_cw(self) -> Tensor:
         """[N,7] world to camera."""
         return self["T_cw"]

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from droidw.geometry import se3
+from droidw.geometry.camera import Grid
+from droidw.graph.store import KeyframeStore
 from droidw.interfaces.uncertainty import (
     Begins,
     Renews,
@@ -143,6 +145,10 @@ def _fields(subject: Subject, part: Any) -> None:
         )
         names.append(entry.name)
     subject.expect("fields", len(set(names)) == len(names), "two fields have the same name")
+    taken = KeyframeStore(Grid(_H, _W, 8, 3.5), torch.ones(4)).names & set(names)
+    subject.expect(
+        "fields", not taken, f"the store has fields of these names already: {', '.join(taken)}"
+    )
 
 
 def _run(subject: Subject, part: Any, channels: int, dtype: torch.dtype, label: str) -> Tensor:

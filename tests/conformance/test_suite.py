@@ -245,6 +245,9 @@ def test_uncertainty_faults_are_caught():
     class Doubled(Constant):
         fields = (StoreField("a", ("h", "w")), StoreField("a", ("c",)))
 
+    class Taken(Constant):
+        fields = (StoreField("prior", ("h", "w")),)
+
     conformance.check_uncertainty_model(component(Constant))
     for clause, part in (
         ("range", Negative),
@@ -254,6 +257,7 @@ def test_uncertainty_faults_are_caught():
         ("state", Forgetful),
         ("between", Numbering),
         ("fields", Doubled),
+        ("fields", Taken),
     ):
         broken(clause, "uncertainty", component(part))
 
